@@ -26,8 +26,8 @@ from mavbridge.guard.wire import (
     encode_from_guard,
 )
 from mavbridge.mavlink.codec.signing import Signing
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
 

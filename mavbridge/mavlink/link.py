@@ -87,7 +87,7 @@ class MavlinkLink:
             signing=signing,
         )
         self._connection = Connection(transport, self._codec, clock, packet_log)
-        self._report = self._connection.texts.append
+        self._report = self._connection.report
         self.fileno, self.close = self._connection.fileno, self._connection.close
         """Descriptor to wait on for arrivals; release of the socket or port."""
         self.transmit = self._connection.send
@@ -153,7 +153,7 @@ class MavlinkLink:
             interruptions=self._interruptions,
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self.commands.refused_mode,
-            texts=(*texts, *output.take_notes()),
+            texts=texts,
         )
 
     def _problem(self, now_ns: int) -> Reason | None:
@@ -273,7 +273,7 @@ class MavlinkLink:
     @property
     def known_params(self) -> Mapping[str, float]:
         """The vehicle's flight-relevant parameters by name, for the report."""
-        return {} if self.vehicle is None else self.vehicle.params.values
+        return {} if self.vehicle is None else dict(sorted(self.vehicle.known_params.items()))
 
     def restore(self) -> bool:
         """Let ``service`` restore the parameters set for the flight; call at every tick until True.
@@ -296,8 +296,8 @@ class MavlinkLink:
             return
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + period_ns(_HEARTBEAT_HZ)
-            kind = self.vehicle.profile.heartbeat_type if self.vehicle else None
-            self._connection.send(self._codec.encode_heartbeat(kind))
+            kinds = (self.vehicle.profile.heartbeat_type,) if self.vehicle else ()
+            self._connection.send(self._codec.encode_heartbeat(*kinds))
         if (vehicle := self.vehicle) is None:
             return
         for request in vehicle.step(now_ns):

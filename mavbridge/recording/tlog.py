@@ -1,7 +1,7 @@
 """``link.tlog``: the packet log, from the link's process to the recording's writer process.
 
 The records come through a separate pipe, so that the log continues after the flight process has
-died. ``mavbridge.mavlink.transport.packet_pipe`` makes them.
+died. ``mavbridge.mavlink.codec.tlog`` makes them.
 """
 
 import os

@@ -27,13 +27,14 @@ class FlownVehicle:
         )
         self.known_params: dict[str, float] = {}
         self.params = SimpleNamespace(is_read=True)
-        self.is_receiver_hidden = False
-        self.is_released = True
+        self.condition = SimpleNamespace(is_receiver_hidden=False, is_released=True)
         self.mode = profile.modes.roles.setpoint[0]
         self.armed = True
         self.is_landed: bool | None = False
         self.has_receiver: bool | None = False
         self.is_failsafe = False
+        self.texts: list[str] = []
+        self.report = self.texts.append
         self.is_known = True
         """True if it has sent a heartbeat since its session began."""
 

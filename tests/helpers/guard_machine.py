@@ -297,7 +297,7 @@ class GuardWorld:
     def _body(self, acts_on: tuple[int, ...]) -> Body:
         boot_us = (self.now_ns - START_NS) // 1000 + 1
         if self.kind == "velocity":
-            return VelocityTarget(boot_us, 0x5C7, (0.0, 0.0, acts_on[0] / 1000), 0.0)
+            return VelocityTarget(0x5C7, (0.0, 0.0, acts_on[0] / 1000))
         if self.autopilot == "px4":
             return ManualControl(*acts_on)
         throttle, yaw, pitch, roll = acts_on

@@ -15,7 +15,6 @@ from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 
 STEP_NS = 10 * NS_PER_MS
-NAMES = ("MIN", "TRIM", "MAX", "REVERSED")
 
 SAFE: dict[str, float] = {
     **CALIBRATION,
@@ -29,9 +28,7 @@ SAFE: dict[str, float] = {
     "ATC_ANGLE_BOOST": 1.0,
     "MOT_THST_HOVER": 0.39,
     "GUID_TIMEOUT": 3.0,
-    "RC7_OPTION": 0.0,
-    "RC8_OPTION": 0.0,
-    "RC1_OPTION": 0.0,
+    **{f"RC{number}_OPTION": 0.0 for number in range(1, 17)},
     "SIMPLE": 0.0,
     "SUPER_SIMPLE": 0.0,
 }

@@ -19,8 +19,14 @@ CALIBRATION = {
     ),
     **{
         f"RC{n}_{part}": value
-        for n in range(1, 5)
-        for part, value in (("MIN", 1100), ("TRIM", 1500), ("MAX", 1900), ("REVERSED", 0))
+        for n in range(1, 9)
+        for part, value in (
+            ("MIN", 1100),
+            ("TRIM", 1500),
+            ("MAX", 1900),
+            ("REVERSED", 0),
+            ("DZ", 20),
+        )
     },
     "FS_THR_VALUE": 975,
 }

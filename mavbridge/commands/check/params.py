@@ -12,13 +12,12 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import ActionKind
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.profiles.profile import (
-    Danger,
     ParamContext,
     ParamNote,
     Profile,
     StreamGroup,
 )
-from mavbridge.mavlink.profiles.sticks import IDENTITY, Half
+from mavbridge.mavlink.profiles.sticks import IDENTITY
 from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
@@ -91,34 +90,34 @@ class Terms:
         notes = list(self.assessment.obstacles)
         if self.assessment.unusable is not None:
             unusable = because(Code.CALIBRATION_UNUSABLE, cause=self.assessment.unusable)
-            notes.append(ParamNote((), str(unusable)))
-        accepted = self.config.link.accept_risk
-        return notes + [each.refused for each in self._dangers if each.risk not in accepted]
+            notes.append(ParamNote("obstacle", (), str(unusable)))
+        return notes + self._dangers(is_accepted=False)
 
     def warnings(self) -> list[ParamNote]:
         """Return the flight's warnings, and hints that only a check gives."""
-        accepted = self.config.link.accept_risk
-        return [
-            *(each.accepted for each in self._dangers if each.risk in accepted),
-            *self.profile.advice(self.values, self.context),
-            *self.profile.hints(self.values, self.context),
-        ]
+        notes = (note for note in self.assessment.notes if note.kind != "obstacle")
+        return [*self._dangers(is_accepted=True), *notes]
 
-    @property
-    def _dangers(self) -> tuple[Danger, ...]:
+    def _dangers(self, *, is_accepted: bool) -> list[ParamNote]:
+        """Return notes about the risks that the user has accepted, or has not."""
         serial = serial_dangers(
             serial_baud(self.settings.connect),
             streams=self.streams,
             stick_hz=self.settings.stick_hz,
         )
-        return (*serial, *self.assessment.dangers)
+        return [
+            danger.note(is_accepted=is_accepted)
+            for danger in (*serial, *self.assessment.dangers)
+            if (danger.risk in self.config.link.accept_risk) is is_accepted
+        ]
 
 
 def param_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield every relevant parameter, then the motion at full stick."""
     refusals, warnings = terms.refusals(), terms.warnings()
     told: list[ParamNote] = []
-    for name, should_be in terms.profile.wanted_params(terms.values, terms.context):
+    wanted = terms.profile.wanted_params(terms.values, terms.context)
+    for name, should_be in wanted.items():
         about = [note for note in refusals + warnings if name in note.names and note not in told]
         told += about
         text = "; ".join(note.text for note in about)
@@ -176,7 +175,6 @@ def _curve_rows(terms: Terms) -> Iterator[CheckRow]:
         yield _row("sticks", "sent as they are", "mapped", text)
         return
     curves = terms.profile.stick_curves(terms.values, mode, gains)
-    shortfalls: dict[str, str] = dict(curves.shortfalls)
     # The object that stands for modes in which sticks have another meaning.
     if curves is IDENTITY:
         yield _row("sticks", f"sent as they are in {mode}", "a mode in which they are mapped")
@@ -184,19 +182,10 @@ def _curve_rows(terms: Terms) -> Iterator[CheckRow]:
     if curves.unmapped is not None:
         yield _row("sticks", "not mapped", "mapped", curves.unmapped)
         return
-    throttle, yaw, lean = curves.throttle, curves.yaw, curves.lean
-    lean_half = (
-        None if lean is None else Half(lean.vehicle.full_deg, parameter=lean.vehicle.parameter)
-    )
-    for noun, unit, trained, half in (
-        ("lean", "deg", gains.lean_deg, lean_half),
-        ("yaw rate", "deg/s", gains.yaw_rate_degps, yaw and yaw.vehicle.above),
-        ("climb", "m/s", gains.climb_mps, throttle and throttle.vehicle.above),
-        ("descent", "m/s", gains.descent_mps, throttle and throttle.vehicle.below),
-    ):
-        note = shortfalls.get(noun, "")
-        found = f"{trained:.3g} {unit}, as in training"
-        if half is not None:
-            mapped = "" if note else ", sticks are mapped"
-            found = f"{half.full:.3g} {unit} ({half.parameter}){mapped}"
-        yield _row(f"full {noun}", found, f"{trained:.3g} {unit}", note)
+    for each in curves.extents:
+        trained = f"{each.policy.full:.3g} {each.unit}"
+        found = f"{trained}, as in training"
+        if each.is_mapped:
+            mapped = "" if each.shortfall else ", sticks are mapped"
+            found = f"{each.vehicle.full:.3g} {each.unit} ({each.vehicle.parameter}){mapped}"
+        yield _row(f"full {each.noun}", found, trained, each.shortfall or "")

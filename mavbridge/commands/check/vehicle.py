@@ -211,7 +211,7 @@ def _link_rows(
     yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
     rates_hz = dict(stats.messages_per_s)
     for group in terms.streams:
-        if not group.is_optional:
+        if group.is_needed:
             yield _rate_row(group, rates_hz, terms.plan)
     lost = stats.lost_fraction or 0.0
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""

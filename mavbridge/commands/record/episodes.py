@@ -12,7 +12,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightMeta, write_meta
 from mavbridge.recording.recorder import Recorder

@@ -18,7 +18,7 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort
 from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.readers import IDS
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.observe.report_table import rate_style, shown_rate
 from mavbridge.observe.terminal import FlightScreen, RateMeter
 from policy.contract import Contract

@@ -2,7 +2,6 @@
 
 import struct
 from binascii import crc_hqx
-from mmap import mmap
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -22,8 +21,8 @@ CHECKSUM_BYTES = 2
 _MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 CURRENT_MODE, EVENT = 436, 410
 """Messages of MAVLink's common dialect that pymavlink's ardupilotmega lacks."""
-_SEEDS = {number: bytes((message.crc_extra,)) for number, message in dialect.mavlink_map.items()}
-_SEEDS |= {CURRENT_MODE: b"\xc1", EVENT: b"\xa0"}
+_SEEDS = {number: message.crc_extra for number, message in dialect.mavlink_map.items()}
+_SEEDS |= {CURRENT_MODE: 0xC1, EVENT: 0xA0}
 """Last byte under the checksum (crc_extra) by message id."""
 
 
@@ -48,11 +47,9 @@ class RawPacket(NamedTuple):
         """True if the checksum is valid; None if the message is unknown."""
         if (seed := _SEEDS.get(self.message_id)) is None:
             return None
-        data, header = self.data, _HEADER_V1 if self.data[0] == MARKER_V1 else HEADER
+        header = _HEADER_V1 if self.data[0] == MARKER_V1 else HEADER
         end = header.size + len(self.payload)
-        # The CRC of data and their checksum is 0.
-        sealed = data[1:end] + seed + data[end : end + CHECKSUM_BYTES]
-        return crc_hqx(sealed.translate(_MIRRORED), 0xFFFF) == 0
+        return checksum(self.data[1:end], seed) == self.data[end : end + CHECKSUM_BYTES]
 
 
 def checksum(data: bytes, crc_extra: int) -> bytes:
@@ -61,7 +58,7 @@ def checksum(data: bytes, crc_extra: int) -> bytes:
     return crc.to_bytes(CHECKSUM_BYTES, "big").translate(_MIRRORED)
 
 
-def frame_at(data: bytes | mmap, at: int) -> RawPacket | None:
+def frame_at(data: bytes, at: int) -> RawPacket | None:
     """Return the packet that begins at ``at``; None if there is no complete one."""
     room = len(data) - at
     marker = data[at] if room > 0 else None

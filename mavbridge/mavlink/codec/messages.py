@@ -94,6 +94,29 @@ def later_by_us(stamp_us: int, other_us: int) -> int:
     return across_us if across_us <= RESTART_STEP_US else stamp_us - other_us
 
 
+class StampOrder:
+    """Order of one message by the vehicle's stamps: late and doubled datagrams are left out.
+
+    Two stamps in a row that are far back mean that the clock has restarted, or that one wrong stamp
+    has ended.
+    """
+
+    def __init__(self) -> None:
+        self.newest_us = 0
+        """0: none yet."""
+        self._old = 0
+
+    def accepts(self, stamp_us: int) -> bool:
+        """Note a stamp; return False if it is late. 0, no stamp, is accepted."""
+        later_us = later_by_us(stamp_us, self.newest_us)
+        if stamp_us > 0 < self.newest_us and later_us <= 0:
+            self._old = self._old + 1 if later_us < -RESTART_STEP_US else 0
+            if self._old < RESTART_STAMPS:
+                return False
+        self.newest_us, self._old = stamp_us, 0
+        return True
+
+
 STICK_END = 1000
 """Full scale of MAVLink MANUAL_CONTROL: x forward, y right and r nose right in -1000..1000, z up in
 0..1000."""
@@ -119,9 +142,6 @@ class ManualControl(NamedTuple):
 class AttitudeTarget(NamedTuple):
     """ATTITUDE_TARGET (83)."""
 
-    boot_us: int
-    type_mask: int
-    ned_from_body_wxyz: tuple[float, float, float, float]
     rate_body_radps: tuple[float, float, float]
     thrust: float
 
@@ -129,10 +149,8 @@ class AttitudeTarget(NamedTuple):
 class VelocityTarget(NamedTuple):
     """POSITION_TARGET_LOCAL_NED (85)."""
 
-    boot_us: int
     type_mask: int
     velocity_ned_mps: tuple[float, float, float]
-    yaw_rate_radps: float
 
 
 class Altitude(NamedTuple):

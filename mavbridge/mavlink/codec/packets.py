@@ -2,8 +2,7 @@
 
 import math
 import re
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -12,7 +11,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
-from mavbridge.mavlink.codec.frames import HEADER, MARKER_V2, SIGNED, RawPacket, checksum, frame_at
+from mavbridge.mavlink.codec.frames import SIGNED, RawPacket, frame_at
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     CommandRequest,
@@ -24,12 +23,12 @@ from mavbridge.mavlink.codec.messages import (
     Request,
     StreamRequest,
 )
-from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, UnusableError
+from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, UNKNOWN, UnusableError
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing
 
-RELEASE_US = 0
+_RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE, channels 1-8: release the channel to the receiver."""
-IGNORE_US = 65535
+_IGNORE_US = 65535
 """RC_CHANNELS_OVERRIDE, channels 1-8: leave the channel unchanged. Not a release."""
 
 _TEXT_BYTES = 50
@@ -39,9 +38,6 @@ _TEXT_CHUNKS = 4
 MOST_DATAGRAM_BYTES = 4096
 """Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
 case takes 0.7 ms; the largest UDP datagram would take 10 ms."""
-_OVERRIDE = dialect.MAVLink_rc_channels_override_message
-_OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
-"""Channels 1 to 8, target system and component. Channels 9 to 18 are zeros, which are truncated."""
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """Start bytes of MAVLink 2 and 1."""
 _MARKER = re.compile(rb"[\xfd\xfe]")
@@ -161,50 +157,41 @@ class Codec:
             body = None if layout is None else layout.read(frame.payload)
         except UnusableError:
             self.bad_data_count += 1
-        name = NAMES.get(frame.message_id) or f"UNKNOWN_{frame.message_id}"
+        name = NAMES.get(frame.message_id, UNKNOWN)
         return ReceivedMessage(frame.source, frame.sequence, name, body, frame.data)
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
+        """Encode the message, sign it if there is a key, and advance the sequence number."""
         data: bytes = message.pack(self._mav)
-        return self._sealed(data, message.crc_extra)
-
-    def _sealed(self, packet: bytes, crc_extra: int) -> bytes:
-        """Sign the packet if there is a key, and advance the sequence number."""
         self._mav.seq = (self._mav.seq + 1) % 256
-        return packet if self.signing is None else self.signing.sign(packet, crc_extra)
+        return data if self.signing is None else self.signing.sign(data, message.crc_extra)
 
-    def encode_heartbeat(self, kind: int | None = None) -> bytes:
-        """Encode HEARTBEAT of a MAV_TYPE; None: an onboard controller, no ground station."""
-        kind = dialect.MAV_TYPE_ONBOARD_CONTROLLER if kind is None else kind
+    def encode_heartbeat(self, kind: int = dialect.MAV_TYPE_ONBOARD_CONTROLLER) -> bytes:
+        """Encode HEARTBEAT of a MAV_TYPE; by default no ground station."""
         autopilot = dialect.MAV_AUTOPILOT_INVALID
         state = dialect.MAV_STATE_ACTIVE
         return self._pack(self._mav.heartbeat_encode(kind, autopilot, 0, 0, state))
 
-    def encode_override(self, target: Endpoint, pwm_us: Pwm, calibration: RcCalibration) -> bytes:
+    def encode_override(
+        self, target: Endpoint, pwm_us: Pwm | None, calibration: RcCalibration
+    ) -> bytes:
         """Encode RC_CHANNELS_OVERRIDE of the four stick channels; the others are left unchanged.
+
+        ``pwm_us`` None releases them to the receiver.
 
         Raises:
             CommandRefusedError: a value that no radio sends, or a throttle that is a failsafe.
         """
-        for channel, value_us in zip(calibration.channels, pwm_us, strict=True):
-            if not PWM_LIMITS_US[0] <= value_us <= PWM_LIMITS_US[1]:
+        channels_us = [_IGNORE_US] * 8
+        for channel, value_us in zip(
+            calibration.channels, pwm_us or (_RELEASE_US,) * 4, strict=True
+        ):
+            if pwm_us and not PWM_LIMITS_US[0] <= value_us <= PWM_LIMITS_US[1]:
                 raise CommandRefusedError(f"{value_us} us on channel {channel.number}")
-        if pwm_us[0] < calibration.throttle_floor_us:
-            raise CommandRefusedError(f"throttle {pwm_us[0]} us is a radio failsafe")
-        return self._encode_channels(target, pwm_us, calibration)
-
-    def encode_release(self, target: Endpoint, calibration: RcCalibration) -> bytes:
-        """Encode RC_CHANNELS_OVERRIDE that releases the four stick channels."""
-        return self._encode_channels(target, (RELEASE_US,) * 4, calibration)
-
-    def _encode_channels(
-        self, target: Endpoint, values_us: Sequence[int], calibration: RcCalibration
-    ) -> bytes:
-        channels_us = [IGNORE_US] * 8
-        for channel, value_us in zip(calibration.channels, values_us, strict=True):
             channels_us[channel.number - 1] = value_us
-        packet = pack_override(self.source, self._mav.seq, target, channels_us)
-        return self._sealed(packet, dialect.MAVLink_rc_channels_override_message.crc_extra)
+        if pwm_us and pwm_us[0] < calibration.throttle_floor_us:
+            raise CommandRefusedError(f"throttle {pwm_us[0]} us is a radio failsafe")
+        return self._pack(self._mav.rc_channels_override_encode(*target, *channels_us))
 
     def encode_manual_control(self, target_system: int, sticks: ManualControl) -> bytes:
         """Encode MANUAL_CONTROL.
@@ -221,54 +208,34 @@ class Codec:
         return self._pack(self._mav.manual_control_encode(target_system, x, y, z, r, 0))
 
     def encode_attitude(
-        self, target: Endpoint, ned_from_body_wxyz: Quaternion, thrust: float, *, now_ns: int
-    ) -> bytes:
-        """Encode SET_ATTITUDE_TARGET with an attitude and a collective thrust in [0, 1].
-
-        Raises:
-            CommandRefusedError: no unit quaternion, too large a lean, or a bad thrust.
-        """
-        _refuse_bad_thrust(thrust)
-        if not abs(math.hypot(*ned_from_body_wxyz) - 1) <= MOST_NORM_ERROR:
-            raise CommandRefusedError(f"{ned_from_body_wxyz} is no unit quaternion")
-        if not tilt_rad(ned_from_body_wxyz) <= MOST_LEAN_RAD:
-            raise CommandRefusedError(f"{ned_from_body_wxyz} leans too far")
-        return self._encode_attitude_target(
-            target, _ATTITUDE_MASK, ned_from_body_wxyz, (0.0, 0.0, 0.0), thrust, now_ns
-        )
-
-    def encode_rates(
         self,
         target: Endpoint,
+        ned_from_body_wxyz: Quaternion | None,
         rate_body_radps: tuple[float, float, float],
         thrust: float,
         *,
         now_ns: int,
     ) -> bytes:
-        """Encode SET_ATTITUDE_TARGET with body rates and a collective thrust in [0, 1].
+        """Encode SET_ATTITUDE_TARGET with a collective thrust in [0, 1].
+
+        ``ned_from_body_wxyz`` None: the vehicle flies the body rates, else the attitude alone.
 
         Raises:
-            CommandRefusedError: a rate above the hard limit, or a bad thrust.
+            CommandRefusedError: no unit quaternion, too large a lean or rate, or a bad thrust.
         """
-        _refuse_bad_thrust(thrust)
+        if not 0.0 <= thrust <= 1.0:  # also false for NaN
+            raise CommandRefusedError(f"thrust {thrust!r} is not in [0, 1]")
+        mask, quaternion = _ATTITUDE_MASK, ned_from_body_wxyz
+        if quaternion is None:
+            mask, quaternion = _RATES_MASK, (1.0, 0.0, 0.0, 0.0)
         if not all(abs(rate) <= MOST_RATE_RADPS for rate in rate_body_radps):
             raise CommandRefusedError(f"body rates {rate_body_radps} rad/s")
-        level = (1.0, 0.0, 0.0, 0.0)
-        return self._encode_attitude_target(
-            target, _RATES_MASK, level, rate_body_radps, thrust, now_ns
-        )
-
-    def _encode_attitude_target(
-        self,
-        target: Endpoint,
-        mask: int,
-        quaternion: Quaternion,
-        rate_radps: tuple[float, float, float],
-        thrust: float,
-        now_ns: int,
-    ) -> bytes:
+        if not abs(math.hypot(*quaternion) - 1) <= MOST_NORM_ERROR:
+            raise CommandRefusedError(f"{quaternion} is no unit quaternion")
+        if not tilt_rad(quaternion) <= MOST_LEAN_RAD:
+            raise CommandRefusedError(f"{quaternion} leans too far")
         message = self._mav.set_attitude_target_encode(
-            _stamp_ms(now_ns), *target, mask, quaternion, *rate_radps, thrust
+            _stamp_ms(now_ns), *target, mask, quaternion, *rate_body_radps, thrust
         )
         return self._pack(message)
 
@@ -354,23 +321,8 @@ def manual_control_of(sticks: Sticks) -> ManualControl:
     return ManualControl(x, y, z, r)
 
 
-def pack_override(
-    source: Endpoint, sequence: int, target: Endpoint, channels_us: Sequence[int]
-) -> bytes:
-    """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8, without trailing zeros (MAVLink 2)."""
-    payload = _OVERRIDE_PAYLOAD.pack(*channels_us, *target).rstrip(b"\0") or b"\0"
-    header = HEADER.pack(MARKER_V2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
-    packet = header + payload
-    return packet + checksum(packet[1:], _OVERRIDE.crc_extra)
-
-
 def _stamp_ms(now_ns: int) -> int:
     return now_ns // NS_PER_MS % 2**32
-
-
-def _refuse_bad_thrust(thrust: float) -> None:
-    if not 0.0 <= thrust <= 1.0:  # also false for NaN
-        raise CommandRefusedError(f"thrust {thrust!r} is not in [0, 1]")
 
 
 def _refuse_bad_sticks(sticks: Sticks) -> None:

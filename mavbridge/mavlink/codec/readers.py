@@ -169,14 +169,14 @@ def _attitude_target(m: dialect.MAVLink_attitude_target_message) -> Body | None:
     q, rate = tuple(m.q), (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
     if not math.isfinite(sum((*q, *rate, m.thrust))):
         return None  # no target
-    return AttitudeTarget(1000 * m.time_boot_ms, m.type_mask, q, rate, m.thrust)
+    return AttitudeTarget(rate, m.thrust)
 
 
 def _velocity_target(m: dialect.MAVLink_position_target_local_ned_message) -> Body | None:
     velocity = (m.vx, m.vy, m.vz)
     if not math.isfinite(sum(velocity)):
         return None  # no target
-    return VelocityTarget(1000 * m.time_boot_ms, m.type_mask, velocity, m.yaw_rate)
+    return VelocityTarget(m.type_mask, velocity)
 
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
@@ -271,3 +271,5 @@ IDS: dict[str, int] = {m.msgname: m.id for m in dialect.mavlink_map.values()} | 
 }
 """Number of each message."""
 NAMES: dict[int, str] = {number: name for name, number in IDS.items()}
+UNKNOWN = "UNKNOWN"
+"""Name of all messages that the dialect lacks."""

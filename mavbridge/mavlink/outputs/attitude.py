@@ -4,7 +4,14 @@ import math
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.rotation import heading_rad, quaternion_from_euler, tilt_rad
-from mavbridge.core.vehicle import Action, ActionMeaning, AttitudeThrust, BodyRates, Output
+from mavbridge.core.vehicle import (
+    Action,
+    ActionMeaning,
+    AdviceText,
+    AttitudeThrust,
+    BodyRates,
+    Output,
+)
 from mavbridge.mavlink.codec.messages import Attitude, AttitudeTarget, Body, SpecificForce
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.outputs.echo import EchoRules, Shown
@@ -87,32 +94,6 @@ _PAUSE_NS = 500 * NS_PER_MS
 _LEVEL_RAD = math.radians(15.0)
 
 
-class HeadingTarget:
-    """Heading to command, since an attitude setpoint has no usable yaw rate.
-
-    It starts at the vehicle's heading, integrates the yaw rate, and has a limited lead.
-    """
-
-    def __init__(self) -> None:
-        self._asked_rad: float | None = None
-        self._at_ns = 0
-
-    def restart(self) -> None:
-        """Restart from the vehicle's own heading."""
-        self._asked_rad = None
-
-    def step(self, measured_rad: float, yaw_rate_radps: float, now_ns: int) -> float:
-        """Return the heading to command now, in [-pi, pi]."""
-        lead_rad, elapsed_ns = 0.0, now_ns - self._at_ns
-        if self._asked_rad is not None and elapsed_ns <= _PAUSE_NS:
-            lead_rad = self._asked_rad - measured_rad + yaw_rate_radps * elapsed_ns / NS_PER_S
-            lead_rad = math.remainder(lead_rad, math.tau)
-            lead_rad = min(max(lead_rad, -MOST_LEAD_RAD), MOST_LEAD_RAD)
-        self._asked_rad = math.remainder(measured_rad + lead_rad, math.tau)
-        self._at_ns = now_ns
-        return self._asked_rad
-
-
 class AttitudeOutput(SetpointOutput):
     """SET_ATTITUDE_TARGET, with an attitude or with body rates.
 
@@ -133,9 +114,9 @@ class AttitudeOutput(SetpointOutput):
         self._hover = HoverThrust()
         self._scale: float | None = None
         """Ratio of the vehicle's thrust to the policy's; constant during a stream."""
-        self._has_guessed = self._has_told = False
-        """The vehicle's hover thrust is unknown; the user was told so."""
-        self._heading = HeadingTarget()
+        self._asked_rad: float | None = None
+        """Heading last commanded; None: start at the vehicle's own."""
+        self._asked_ns = 0
         self._measured_rad: float | None = None
         self._is_level = False
         self._cos_tilt = 1.0
@@ -145,22 +126,12 @@ class AttitudeOutput(SetpointOutput):
         super().restart()
         self._hover, self._scale, self._measured_rad = HoverThrust(), None, None
         self._cos_tilt = 1.0
-        self._heading.restart()
-
-    def take_notes(self) -> tuple[str, ...]:
-        """Return a note if the thrust is not matched to the vehicle, once."""
-        if not self._has_guessed or self._has_told:
-            return ()
-        self._has_told = True
-        return (
-            "the thrust at which this vehicle hovers is not known (MOT_THST_HOVER, MPC_THR_HOVER): "
-            f"the policy's thrust goes out as it is, with which {self._trained_hover:g} hovers",
-        )
+        self._asked_rad = None
 
     def released(self) -> None:
         """Note the end of sending; the next stream starts afresh."""
         super().released()
-        self._heading.restart()
+        self._asked_rad = None
         self._scale = None
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
@@ -182,28 +153,34 @@ class AttitudeOutput(SetpointOutput):
             shown = self.echo.with_dither(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS
         policy_thrust = thrust / scale
+        expected = self._expected(shown, vehicle, now_ns) if is_checked else None
         if isinstance(action, BodyRates):
-            flown = action._replace(thrust=policy_thrust)
-            return self._encode_rates(flown, vehicle, thrust, shown if is_checked else None, now_ns)
+            rates = action._replace(thrust=policy_thrust)
+            return self._encode_rates(rates, vehicle, thrust, expected, now_ns)
         if self._measured_rad is None:
             return None
         if not self._follows(vehicle, now_ns):
-            self._heading.restart()
-        heading = self._heading.step(self._measured_rad, action.yaw_rate_radps, now_ns)
+            self._asked_rad = None
+        heading = self._next_heading_rad(self._measured_rad, action.yaw_rate_radps, now_ns)
         quaternion = quaternion_from_euler(action.roll_rad, action.pitch_rad, heading)
         packet = self._codec.encode_attitude(
-            vehicle.identity.source, quaternion, thrust, now_ns=now_ns
+            vehicle.identity.source, quaternion, (0.0, 0.0, 0.0), thrust, now_ns=now_ns
         )
-        is_checked = is_checked and not self._shows_rates
-        return Encoded(packet, action._replace(thrust=policy_thrust), shown if is_checked else None)
+        flown = action._replace(thrust=policy_thrust)
+        return Encoded(packet, flown, None if self._shows_rates else expected)
 
-    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """See `ActionOutput`; level, at the vehicle's own heading."""
-        if not isinstance(action, AttitudeThrust) or self._measured_rad is None:
-            return None
-        level = quaternion_from_euler(0.0, 0.0, self._measured_rad)
-        thrust = min((self._scale or 1.0) * action.thrust, 1.0)
-        return self._codec.encode_attitude(vehicle.identity.source, level, thrust, now_ns=now_ns)
+    def _next_heading_rad(self, measured_rad: float, yaw_rate_radps: float, now_ns: int) -> float:
+        """Return the heading to command now, in [-pi, pi]: a setpoint has no usable yaw rate.
+
+        It starts at the vehicle's heading, integrates the yaw rate, and has a limited lead.
+        """
+        lead_rad, elapsed_ns = 0.0, now_ns - self._asked_ns
+        if self._asked_rad is not None and elapsed_ns <= _PAUSE_NS:
+            lead_rad = self._asked_rad - measured_rad + yaw_rate_radps * elapsed_ns / NS_PER_S
+            lead_rad = math.remainder(lead_rad, math.tau)
+            lead_rad = min(max(lead_rad, -MOST_LEAD_RAD), MOST_LEAD_RAD)
+        self._asked_rad, self._asked_ns = math.remainder(measured_rad + lead_rad, math.tau), now_ns
+        return self._asked_rad
 
     def _encode_rates(
         self,
@@ -213,20 +190,27 @@ class AttitudeOutput(SetpointOutput):
         shown: Shown | None,
         now_ns: int,
     ) -> Encoded:
-        self._heading.restart()
+        self._asked_rad = None
         rates = tuple(round(rate * RATE_UNITS) for rate in action[1:])
         if self._shows_rates:
-            shown = rates = self.echo.with_dither(rates, now_ns)
+            rates = self.echo.with_dither(rates, now_ns)
+            shown = self._expected(rates, vehicle, now_ns)
         roll, pitch, yaw = (rate / RATE_UNITS for rate in rates)
-        packet = self._codec.encode_rates(
-            vehicle.identity.source, (roll, pitch, yaw), thrust, now_ns=now_ns
+        packet = self._codec.encode_attitude(
+            vehicle.identity.source, None, (roll, pitch, yaw), thrust, now_ns=now_ns
         )
         return Encoded(packet, BodyRates(action.thrust, roll, pitch, yaw), shown)
 
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
         hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.known_params)
         if hover is None or not PLAUSIBLE_THRUST[0] < hover < PLAUSIBLE_THRUST[1]:
-            self._has_guessed = True
+            vehicle.report(
+                AdviceText(
+                    "the thrust at which this vehicle hovers is not known (MOT_THST_HOVER, "
+                    "MPC_THR_HOVER): the policy's thrust goes out as it is, with which "
+                    f"{self._trained_hover:g} hovers"
+                )
+            )
             return 1.0
         return hover / self._trained_hover
 

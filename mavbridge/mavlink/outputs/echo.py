@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import RESTART_STAMPS, RESTART_STEP_US
+from mavbridge.mavlink.codec.messages import StampOrder
 
 Shown: TypeAlias = tuple[int, ...]
 """Numbers of a message in its own units, for example the PWM of the four sticks in RC_CHANNELS."""
@@ -84,10 +84,9 @@ class EchoCheck:
         """Last values shown before ours."""
         self._matched_ns: int | None = None
         """Arrival of the last echo; None: not confirmed."""
-        self._shown_us: int | None = None
+        self._order = StampOrder()
         self._arrived_ns: int | None = None
         """Arrival of the last echo message."""
-        self._old_stamps = 0
         self._held: Shown | None = None
         self._held_since_us = 0
         self._held_samples = 0
@@ -150,21 +149,22 @@ class EchoCheck:
     def released(self) -> None:
         """Note the end of sending; the next command starts a new check."""
         self.shows_last &= not self.is_sending
-        self._since_ns = self._matched_ns = self._held = None
-        self._returned_us.clear()
-        self._foreign_us.clear()
+        self._since_ns = self._matched_ns = None
+        self._forget_shown()
 
     def received(self, values: Shown, shown_us: int, now_ns: int) -> None:
         """Compare the values of one message with the vehicle's timestamp ``shown_us``.
 
-        Late and duplicate datagrams are skipped. Two old timestamps in a row mean that the clock
-        has restarted, or that one wrong timestamp has ended.
+        Late and duplicate datagrams are skipped.
         """
-        if self._is_late(shown_us):
+        newest_us = self._order.newest_us
+        if not self._order.accepts(shown_us):
             return
+        if shown_us < newest_us:  # do not compare old stamps with new ones
+            self._forget_shown()
         if self.is_unshown(now_ns) and self._arrived_ns is not None:
             self._restart(now_ns)
-        self._shown_us, self._arrived_ns = shown_us, now_ns
+        self._arrived_ns = now_ns
         if self._since_ns is None:
             self._baseline = values
             apart = self._rules.release_tolerance
@@ -190,19 +190,11 @@ class EchoCheck:
         if self.confirmed:
             self._watch_change(values, shown_us, now_ns)
 
-    def _is_late(self, shown_us: int) -> bool:
-        """True if the timestamp is not newer than the last one and the clock has not restarted."""
-        if self._shown_us is None or shown_us > self._shown_us:
-            self._old_stamps = 0
-            return False
-        is_far_back = shown_us + RESTART_STEP_US < self._shown_us
-        self._old_stamps = self._old_stamps + 1 if is_far_back else 0
-        if self._old_stamps < RESTART_STAMPS:
-            return True
-        self._old_stamps, self._held = 0, None  # do not compare old stamps with new ones
+    def _forget_shown(self) -> None:
+        """Start counting anew what the vehicle shows."""
+        self._held = None
         self._returned_us.clear()
         self._foreign_us.clear()
-        return False
 
     def _is_near(self, one: Shown, other: Shown) -> bool:
         return _is_within(self._rules.tolerance, one, other)
@@ -213,18 +205,15 @@ class EchoCheck:
 
     def _note_pause(self, values: Shown, now_ns: int) -> None:
         """Judge nothing; after a long pause, store the values as the new baseline."""
-        self._held = None
-        self._returned_us.clear()
-        self._foreign_us.clear()
+        self._forget_shown()
         if not self._sent or now_ns - self._sent[-1][0] > MATCH_NS:
             self._baseline = values
 
     def _restart(self, now_ns: int) -> None:
         """Restart echo tracking after a gap in echoes or commands, when any value is legitimate."""
         if self.is_sending:
-            self._since_ns, self._matched_ns, self._held = now_ns, None, None
-            self._returned_us.clear()
-            self._foreign_us.clear()
+            self._since_ns, self._matched_ns = now_ns, None
+            self._forget_shown()
         if self._fault == "unseen":
             self._fault = None
 

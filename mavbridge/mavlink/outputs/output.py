@@ -20,6 +20,8 @@ class Encoded(NamedTuple):
     """Action as the packet expresses it, in the policy's terms."""
     shown: Shown | None
     """Expected echo; None: nothing to check."""
+    saturated: tuple[str, ...] = ()
+    """Sticks that demand more than the vehicle can do."""
 
 
 class ActionOutput(ABC):
@@ -70,16 +72,9 @@ class ActionOutput(ABC):
         if encoded.shown is not None:
             self.echo.tried(now_ns)
 
-    @abstractmethod
-    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Encode an action at rest for later, without dither and without side effects.
-
-        Raises:
-            CommandRefusedError: the action must not be sent.
-        """
-
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note an action that was sent."""
+        self.saturated.update(encoded.saturated)
         if encoded.shown is not None:
             self.echo.sent(encoded.shown, now_ns)
 
@@ -87,8 +82,8 @@ class ActionOutput(ABC):
         """Process a message of the vehicle, possibly an echo, before the session does."""
         self._compare(body, vehicle, arrived_ns)
         if self.hides_receiver:
-            vehicle.is_receiver_hidden = self.echo.has_sent
-            vehicle.is_released = self.echo.is_released and not self.echo.is_sending
+            vehicle.condition.is_receiver_hidden = self.echo.has_sent
+            vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
 
     @abstractmethod
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
@@ -111,10 +106,6 @@ class ActionOutput(ABC):
     def echo_confirmed(self) -> bool:
         """True if the vehicle was seen to act on our packets, or shows no echo now."""
         return self.echo.confirmed
-
-    def take_notes(self) -> tuple[str, ...]:
-        """Return notes for the user, each once."""
-        return ()
 
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int

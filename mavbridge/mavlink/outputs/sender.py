@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from copy import copy
 
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import PeerError
@@ -137,9 +138,9 @@ class ActionSender:
     ) -> Iterator[tuple[int, bytes]]:
         """Yield delays [ns] and packets of resting decisions and mode requests, for later.
 
-        No side effects. A packet that the codec refuses is skipped.
+        Encoded by a copy of the output. A packet that the codec refuses is skipped.
         """
-        vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
+        vehicle, output, now_ns = self._vehicle, copy(self.output), self._clock.now_ns()
         if vehicle is None:
             return
         with self._codec.rehearsing():
@@ -149,7 +150,8 @@ class ActionSender:
                     if isinstance(decision, Release) and output is not None:
                         packet = output.release_packet(vehicle, now_ns)
                     elif isinstance(decision, Command) and output is not None:
-                        packet = output.encode_resting(decision.action, vehicle, now_ns)
+                        encoded = output.encode(decision.action, vehicle, now_ns)
+                        packet = None if encoded is None else encoded.packet
                 if packet is not None:
                     yield after_ns, packet
                 if mode is not None:

@@ -9,7 +9,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Action, ActionMeaning, Output, Velocity
 from mavbridge.mavlink.codec.messages import Body, VelocityTarget
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
-from mavbridge.mavlink.outputs.echo import EchoRules
+from mavbridge.mavlink.outputs.echo import EchoRules, Shown
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
@@ -53,29 +53,20 @@ class SetpointOutput(ActionOutput):
         roles = vehicle.profile.modes.roles
         return status is not None and status.armed and status.mode in roles.setpoint
 
-    def _is_taking_off(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """True if the vehicle is on the ground, or has only just left it."""
+    def _expected(self, shown: Shown, vehicle: VehicleSession, now_ns: int) -> Shown | None:
+        """Return the echo to expect; None in other modes, on the ground and just above it."""
         status = vehicle.status(now_ns)
         if status is not None and status.is_landed is True:
             self._ground_ns = now_ns
-        return self._ground_ns is not None and now_ns - self._ground_ns <= self.takeoff_ns
-
-    def _has_echo(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> bool:
-        is_taking_off = self._is_taking_off(vehicle, now_ns)
-        return encoded.shown is not None and self._follows(vehicle, now_ns) and not is_taking_off
-
-    def refused(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note an action that could not be sent."""
-        if self._has_echo(encoded, vehicle, now_ns):
-            super().refused(encoded, vehicle, now_ns)
+        is_low = self._ground_ns is not None and now_ns - self._ground_ns <= self.takeoff_ns
+        return shown if self._follows(vehicle, now_ns) and not is_low else None
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note an action that was sent, and expect its echo if it has one."""
         self._sent_ns = now_ns
-        self._is_checked = self._has_echo(encoded, vehicle, now_ns)
-        if self._is_checked and encoded.shown is not None:
-            self.echo.sent(encoded.shown, now_ns)
-        else:
+        self._is_checked = encoded.shown is not None
+        super().sent(encoded, vehicle, now_ns)
+        if not self._is_checked:
             super().released()
 
     def released(self) -> None:
@@ -139,15 +130,7 @@ class VelocityOutput(SetpointOutput):
         packet = self._codec.encode_velocity(
             vehicle.identity.source, sent, is_heading_frame=self._is_heading_frame, now_ns=now_ns
         )
-        return Encoded(packet, sent, shown)
-
-    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """See `ActionOutput`."""
-        if not isinstance(action, Velocity):
-            return None
-        return self._codec.encode_velocity(
-            vehicle.identity.source, action, is_heading_frame=self._is_heading_frame, now_ns=now_ns
-        )
+        return Encoded(packet, sent, self._expected(shown, vehicle, now_ns))
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the down velocity, if the target has one (a takeoff has a position)."""

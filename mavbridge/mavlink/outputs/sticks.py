@@ -30,9 +30,6 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 _CURVES_NS = 500 * NS_PER_MS
 """Longest delay until a parameter change reaches the stick curves; a mode change does at once."""
 
-_MOST_TOLD = 100
-"""Largest number of notes: they quote parameter values, which may change without end."""
-
 
 class StickOutput(ActionOutput):
     """Sticks, mapped so that the vehicle moves as it did in the policy's training."""
@@ -46,12 +43,6 @@ class StickOutput(ActionOutput):
         self._curves = IDENTITY
         self._curves_mode = ""
         self._curves_due_ns = 0
-        self._saturating: tuple[str, ...] = ()
-        """Sticks of the last action that demand more than the vehicle can do."""
-        self._mapped: tuple[VehicleStatus, StickCurves, VehicleStatus] | None = None
-        """Cached conversion: status of the vehicle, curves, status in the policy's terms."""
-        self._new_notes: list[str] = []
-        self._told: set[str] = set()
         self._status: VehicleStatus | None = None
         """Last status of the vehicle, kept when its session restarts."""
 
@@ -60,71 +51,44 @@ class StickOutput(ActionOutput):
         super().restart()
         self._curves_mode, self._curves_due_ns = "", 0
 
-    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note sticks that were sent."""
-        super().sent(encoded, vehicle, now_ns)
-        self.saturated.update(self._saturating)
-
-    def take_notes(self) -> tuple[str, ...]:
-        """Return the policy's demands that this vehicle cannot meet, for the user; each once."""
-        notes, self._new_notes = tuple(self._new_notes), []
-        return notes
-
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
         """Return the status with its sticks converted to the policy's."""
         self._status = status or self._status
-        if self._gains is None or status is None:
-            return status
+        if status is None:
+            return None
         curves = self._curves_of(vehicle, status.mode, now_ns)
         if curves.is_identity or (status.rc_sticks is None and status.pilot_sticks is None):
             return status
-        if self._mapped is None or self._mapped[0] is not status or self._mapped[1] is not curves:
-            rc, pilot = status.rc_sticks, status.pilot_sticks
-            told = replace(
-                status,
-                rc_sticks=None if rc is None else curves.to_policy(rc),
-                pilot_sticks=None if pilot is None else curves.to_policy(pilot),
-            )
-            self._mapped = (status, curves, told)
-        return self._mapped[2]
-
-    def _resting(self, action: Action) -> Sticks:
-        """Return the vehicle's sticks for an action, by the curves in use."""
-        if not isinstance(action, Sticks):
-            raise CommandRefusedError(f"{type(action).__name__} are not sticks")
-        is_same = action is IDLE or self._curves.is_identity
-        return action if is_same else self._curves.to_vehicle(action)
+        rc, pilot = status.rc_sticks, status.pilot_sticks
+        return replace(
+            status,
+            rc_sticks=None if rc is None else curves.to_policy(rc),
+            pilot_sticks=None if pilot is None else curves.to_policy(pilot),
+        )
 
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
-    ) -> tuple[Sticks, StickCurves]:
-        """Return the vehicle's sticks for an action, and the curves for the inverse.
+    ) -> tuple[Sticks, StickCurves, tuple[str, ...]]:
+        """Return the vehicle's sticks, the curves for the inverse, and the saturated sticks.
 
         ``IDLE`` is not mapped: it means the stop at the bottom, for arming.
         """
-        self._saturating = ()
         if not isinstance(action, Sticks):
             raise CommandRefusedError(f"{type(action).__name__} are not sticks")
-        if self._gains is None or action is IDLE:
-            return action, IDENTITY
+        if action is IDLE:
+            return action, IDENTITY, ()
         status = vehicle.status(now_ns)
         curves = self._curves_of(vehicle, status.mode if status else "", now_ns)
-        if curves.is_identity:
-            return action, curves
-        self._saturating = curves.saturated(action)
-        return curves.to_vehicle(action), curves
+        return curves.to_vehicle(action), curves, curves.saturated(action)
 
     def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:
         if mode != self._curves_mode or now_ns >= self._curves_due_ns:
             self._curves_mode, self._curves_due_ns = mode, now_ns + _CURVES_NS
             self._curves = vehicle.profile.stick_curves(vehicle.known_params, mode, self._gains)
-            for note in self._curves.notes:
-                is_new = note not in self._told and len(self._told) < _MOST_TOLD
-                if is_new and vehicle.params.is_read:
-                    self._told.add(note)
-                    self._new_notes.append(AdviceText(note))
+            for note in self._curves.notes if vehicle.params.is_read else ():
+                vehicle.report(AdviceText(note))
         return self._curves
 
 
@@ -160,7 +124,7 @@ class OverrideOutput(StickOutput):
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the override of the four sticks; return None without a calibration."""
-        sticks, curves = self._wanted(action, vehicle, now_ns)
+        sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
         calibration = vehicle.calibration
         if calibration is None:
             return None
@@ -169,14 +133,7 @@ class OverrideOutput(StickOutput):
         pwm_us = (throttle, yaw, pitch, roll)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         self._calibration, self._last = calibration, pwm_us
-        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown)
-
-    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """See `ActionOutput`."""
-        if (calibration := vehicle.calibration) is None:
-            return None
-        pwm_us = pwm_of(self._resting(action), calibration)
-        return self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown, saturated)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS with the sent override."""
@@ -209,7 +166,7 @@ class OverrideOutput(StickOutput):
         """Encode the release of the four channels."""
         if self._calibration is None:
             return None
-        return self._codec.encode_release(vehicle.identity.source, self._calibration)
+        return self._codec.encode_override(vehicle.identity.source, None, self._calibration)
 
 
 MANUAL_ECHO = EchoRules(
@@ -300,18 +257,13 @@ class ManualControlOutput(StickOutput):
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the four sticks, rounded."""
-        sticks, curves = self._wanted(action, vehicle, now_ns)
+        sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
         shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
         x, y, z, r = shown
         values = ManualControl(x, y, z, r)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
         self._last = values
-        return Encoded(packet, curves.to_policy(values.sticks), shown)
-
-    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """See `ActionOutput`."""
-        values = manual_control_of(self._resting(action))
-        return self._codec.encode_manual_control(vehicle.identity.source.system, values)
+        return Encoded(packet, curves.to_policy(values.sticks), shown, saturated)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the sticks that the vehicle acts on; they have no timestamp of the vehicle."""

@@ -18,7 +18,7 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     calibration,
     calibration_names,
     is_simple_setting,
-    stick_settings,
+    stick_notes,
 )
 from mavbridge.mavlink.profiles.profile import (
     NO_HEALTH,
@@ -30,10 +30,6 @@ from mavbridge.mavlink.profiles.profile import (
     ParamNote,
     Profile,
     StreamGroup,
-    WantedParam,
-    optional_stream,
-    setpoint_danger,
-    stick_obstacles,
 )
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
@@ -44,8 +40,6 @@ between two samples. Costs 3.2 kB/s."""
 HEARTBEAT_HZ = 10.0
 """Shows arming within 100 ms despite one lost packet (at 1 Hz within 1 s); a mode change is sent at
 once at any rate."""
-_TARGET_HZ = 50.0
-"""Rate of ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED for the echo check."""
 
 _OVERRIDE_SWITCH_OPTION = 46
 """RCn_OPTION "RC Override Enable": overrides are refused while the switch is low."""
@@ -85,12 +79,14 @@ _FIRST_NAMES = (
 _SIMPLE_MODE_OFF = (3.0, 0.0)
 """Auxiliary function and switch position (low)."""
 
+_MODE_NAMES = {
+    number: entry.name.removeprefix("COPTER_MODE_")
+    for number, entry in dialect.enums["COPTER_MODE"].items()
+    if not entry.name.endswith("ENUM_END")
+}
 _MODES = ModeTable(
-    {
-        number: entry.name.removeprefix("COPTER_MODE_")
-        for number, entry in dialect.enums["COPTER_MODE"].items()
-        if not entry.name.endswith("ENUM_END")
-    },
+    _MODE_NAMES,
+    {name: (number, 0) for number, name in _MODE_NAMES.items()},
     roles=ModeRoles(
         hold="BRAKE",
         land="LAND",
@@ -117,49 +113,39 @@ class ArduPilot(Profile):
         "manual-control": "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
     }
     params = _FIRST_NAMES
+    setpoint_timeout = "GUID_TIMEOUT"
+    target_hz = 50.0
+    stick_echo = StreamGroup(
+        ("RC_CHANNELS",), RC_CHANNELS_HZ, True, dialect.MAV_DATA_STREAM_RC_CHANNELS
+    )
+    """Shows overrides exactly."""
+    hover_param = "MOT_THST_HOVER"
+    boost_param = "ATC_ANGLE_BOOST"
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
         """See `Profile`. Legacy streams serve links on which no command is acknowledged.
 
         The IMU is requested in floats first.
         """
-        attitude, imu, radio = (
-            ("ATTITUDE_QUATERNION", "ATTITUDE"),
-            ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
-            ("RC_CHANNELS",),
-        )
+        attitude = ("ATTITUDE_QUATERNION", "ATTITUDE")
+        imu = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
         return (
-            StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
-            StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
-            StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
-            StreamGroup(radio, dialect.MAV_DATA_STREAM_RC_CHANNELS, pilot_hz or RC_CHANNELS_HZ),
-            optional_stream("SYS_STATUS", 2.0, without=NO_HEALTH),
-            optional_stream("EXTENDED_SYS_STATE", 5.0, without=NO_LANDING),
-            optional_stream("EKF_STATUS_REPORT", 5.0, without=NO_POSITION_WORD),
-            optional_stream("HEARTBEAT", HEARTBEAT_HZ),
+            StreamGroup(attitude, state_hz, True, dialect.MAV_DATA_STREAM_EXTRA1),
+            StreamGroup(("LOCAL_POSITION_NED",), state_hz, True, dialect.MAV_DATA_STREAM_POSITION),
+            StreamGroup(imu, state_hz, True, dialect.MAV_DATA_STREAM_RAW_SENSORS),
+            self.stick_echo._replace(rate_hz=pilot_hz or RC_CHANNELS_HZ),
+            StreamGroup(("SYS_STATUS",), 2.0, without=NO_HEALTH),
+            StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without=NO_LANDING),
+            StreamGroup(("EKF_STATUS_REPORT",), 5.0, without=NO_POSITION_WORD),
+            StreamGroup(("HEARTBEAT",), HEARTBEAT_HZ),
         )
-
-    def echo(self, output: Output) -> StreamGroup:
-        """See `Profile`. RC_CHANNELS shows overrides exactly; targets are shown after shaping."""
-        if output in ("attitude", "rates"):
-            return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
-        if output == "velocity":
-            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, least_hz=0.0)
-        legacy = dialect.MAV_DATA_STREAM_RC_CHANNELS
-        return StreamGroup(("RC_CHANNELS",), legacy, RC_CHANNELS_HZ)
-
-    def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return calibration, dead zones and stick settings of RCMAP_*'s channels."""
-        known = (values.get(f"RCMAP_{stick}") for stick in STICKS)
-        dead_zones = (f"RC{int(number)}_DZ" for number in known if number is not None)
-        settings = (each.name for each in stick_settings(values))
-        more = (name for name in settings if name not in _FIRST_NAMES)
-        return (*calibration_names(values), *dead_zones, *more)
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the calibration's parameters, and those that decide a flight's safety."""
+        """Return the channels' parameters, and those that decide a flight's safety."""
+        channels = [int(values[n]) for stick in STICKS if (n := f"RCMAP_{stick}") in values]
+        more = (f"RC{number}_{part}" for number in channels for part in ("DZ", "OPTION"))
         thrust_names = ("GUID_OPTIONS", "ATC_ANGLE_BOOST", "MOT_THST_HOVER")
-        return (*calibration_names(values), *_RISK_NAMES, *thrust_names)
+        return (*calibration_names(values), *more, *SIMPLE_NAMES, *_RISK_NAMES, *thrust_names)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """Return the calibration from RCMAP_* and RCn_*."""
@@ -180,88 +166,49 @@ class ArduPilot(Profile):
             return CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, _SIMPLE_MODE_OFF)
         return None
 
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield settings that ignore or turn overrides, or take thrust for a climb rate."""
+    def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
+        """See `Profile`."""
         if context.output == "rc-override":
-            yield from _override_obstacles(values, context.source_system)
-        elif context.output in ("attitude", "rates"):
-            options = values.get("GUID_OPTIONS")
-            if options is None:
-                yield ParamNote(
-                    ("GUID_OPTIONS",), "it has not sent GUID_OPTIONS, which is asked for again"
-                )
-            elif not int(options) & _THRUST_AS_THRUST:
-                yield ParamNote(
-                    ("GUID_OPTIONS",),
-                    f"GUID_OPTIONS is {options:g}, with which it takes our thrust for a climb rate",
-                    f"--set GUID_OPTIONS={int(options) | _THRUST_AS_THRUST}",
-                )
+            yield from _override_notes(values, context, self.override_switch(values))
+        elif context.output is not None:
+            yield from _setpoint_notes(values, context)
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Yield settings under which sticks would stay for ever, or setpoints for long."""
-        if context.output == "rc-override":
-            time_s = values.get("RC_OVERRIDE_TIME")
-            if time_s is not None and time_s < 0:
-                why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
-                yield Danger(
-                    "endless-override", why, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5"
-                )
-            if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
-                why = because(Code.NO_THROTTLE_FAILSAFE)
-                yield Danger("no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1")
-        elif context.output is not None:
-            yield from setpoint_danger(values, "GUID_TIMEOUT")
-
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield long timeouts, and obstacles to arming."""
-        if context.output == "rc-override":
-            yield from _override_advice(values)
-        elif context.output is not None:
-            yield from _setpoint_advice(values, context)
-
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield failsafes and switches that make a flight safer."""
+        """See `Profile`. Yield also settings under which sticks would stay for ever."""
+        yield from super().dangers(values, context)
         if context.output != "rc-override":
             return
-        options = values.get("FS_OPTIONS")
-        lands_on = options is None or int(options) & _CONTINUE_LANDING
-        if context.has_receiver is False and options is not None and not lands_on:
-            yield ParamNote(
-                ("FS_OPTIONS",),
-                f"FS_OPTIONS is {options:g}: without a receiver, a landing turns into RTL when the "
-                "sticks end",
-                f"--set FS_OPTIONS={int(options) | _CONTINUE_LANDING}",
-            )
-        if context.has_receiver and self.override_switch(values) is None:
-            yield ParamNote(
-                ("RCn_OPTION",),
-                "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
-                "autopilot itself, whatever happens here",
-            )
+        time_s = values.get("RC_OVERRIDE_TIME", 0.0)
+        if time_s < 0:
+            why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
+            yield Danger("endless-override", why, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5")
+        if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
+            why = because(Code.NO_THROTTLE_FAILSAFE)
+            yield Danger("no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1")
 
-    def wanted_params(
-        self, values: Mapping[str, float], context: ParamContext
-    ) -> Iterator[WantedParam]:
-        """Yield the parameters for overrides, or for setpoints."""
+    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
+        """See `Profile`."""
         if context.output == "rc-override":
-            name = "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID"
-            yield WantedParam(name, f"{context.source_system}, our system id")
-            yield WantedParam("RC_OPTIONS", "bit 1 clear")
-            yield WantedParam("RC_OVERRIDE_TIME", f"0.5; above 0, at most {_LONGEST_S:g} s")
-            for name in SIMPLE_NAMES:
-                yield WantedParam(name, "0")
-            receiver = "" if context.has_receiver else ", without a receiver"
-            yield WantedParam("FS_THR_ENABLE", f"not 0{receiver}")
-            yield WantedParam("FS_OPTIONS", "any" if context.has_receiver else "24 (bit 3 set)")
-            if (switch := self.override_switch(values)) is not None:
-                yield WantedParam(f"RC{switch}_OPTION", "46, with its switch on")
-            return
-        yield WantedParam("GUID_TIMEOUT", f"0.5; at most {_LONGEST_S:g} s")
-        yield WantedParam("FS_THR_ENABLE", "not 0" if context.has_receiver else "0")
+            switch = self.override_switch(values)
+            return {
+                "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID": (
+                    f"{context.source_system}, our system id"
+                ),
+                "RC_OPTIONS": "bit 1 clear",
+                "RC_OVERRIDE_TIME": f"0.5; above 0, at most {_LONGEST_S:g} s",
+                **dict.fromkeys(SIMPLE_NAMES, "0"),
+                "FS_THR_ENABLE": "not 0" if context.has_receiver else "not 0, without a receiver",
+                "FS_OPTIONS": "any" if context.has_receiver else "24 (bit 3 set)",
+            } | ({} if switch is None else {f"RC{switch}_OPTION": "46, with its switch on"})
+        wanted = {
+            "GUID_TIMEOUT": f"0.5; at most {_LONGEST_S:g} s",
+            "FS_THR_ENABLE": "not 0" if context.has_receiver else "0",
+        }
         if context.output in ("attitude", "rates"):
-            yield WantedParam("GUID_OPTIONS", "bit 3 (8) set")
-            boost = "1, or as in training" if context.output == "attitude" else "any"
-            yield WantedParam("ATC_ANGLE_BOOST", boost)
+            wanted["GUID_OPTIONS"] = "bit 3 (8) set"
+            is_boosted = context.output == "attitude"
+            wanted["ATC_ANGLE_BOOST"] = "1, or as in training" if is_boosted else "any"
+        return wanted
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
@@ -269,94 +216,94 @@ class ArduPilot(Profile):
         """Return the curves of lean, yaw rate and climb rate in ALT_HOLD and STABILIZE."""
         return ardupilot_curves(values, mode, gains)
 
-    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """Return MOT_THST_HOVER, which the vehicle learns in flight."""
-        return values.get("MOT_THST_HOVER")
-
-    def boosts_thrust(self, values: Mapping[str, float]) -> bool:
-        """True unless ATC_ANGLE_BOOST is 0."""
-        return values.get("ATC_ANGLE_BOOST", 1.0) != 0
-
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest:
         """Return NAV_TAKEOFF for GUIDED; its height counts from home, the arming place."""
         return CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, height_m))
 
 
-def _override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[ParamNote]:
-    """Yield settings under which this vehicle would ignore our overrides."""
+def _override_notes(
+    values: Mapping[str, float], context: ParamContext, switch: int | None
+) -> Iterator[ParamNote]:
+    """Yield what ignores, turns or keeps overrides; ``switch``: channel that enables them."""
     low = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
     if low is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
-        if not low <= source_system <= high:
+        if not low <= context.source_system <= high:
             yield ParamNote(
+                "obstacle",
                 ("MAV_GCS_SYSID", "SYSID_MYGCS"),
-                f"it obeys system {low:.0f} and we are system {source_system}",
+                f"it obeys system {low:.0f} and we are system {context.source_system}",
                 f"--set-config link.source_system={low:.0f}",
                 ", or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)",
             )
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:
         yield ParamNote(
+            "obstacle",
             ("RC_OPTIONS",),
             "RC_OPTIONS bit 1 (ignore overrides) is set",
             f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}",
         )
-    if values.get("RC_OVERRIDE_TIME") == 0:
-        yield ParamNote(
-            ("RC_OVERRIDE_TIME",),
-            "RC_OVERRIDE_TIME is 0, which disables overrides",
-            "--set RC_OVERRIDE_TIME=0.5",
+    time_s = values.get("RC_OVERRIDE_TIME", 1.0)
+    if time_s == 0:
+        yield ParamNote.of(
+            "obstacle", "RC_OVERRIDE_TIME", time_s, ", which disables overrides", 0.5
         )
-    yield from stick_obstacles(stick_settings(values), values)
-
-
-def _override_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """Yield warnings before a flight by overrides."""
-    missing = [name for name in _RISK_NAMES if name not in values]
-    if missing:
-        yield ParamNote(
-            tuple(missing),
-            f"the vehicle has not sent {', '.join(missing)}: whether it holds its last sticks for "
-            "ever if this computer dies is not known",
-        )
-    if missing := [name for name in SIMPLE_NAMES if name not in values]:
-        yield ParamNote(
-            tuple(missing),
-            f"the vehicle has not sent {', '.join(missing)}: whether {TURNED}the heading at "
-            "arming is not known",
-        )
-    time_s = values.get("RC_OVERRIDE_TIME", 0.0)
+    yield from stick_notes(values)
+    for names, unknown in (
+        (_RISK_NAMES, "it holds its last sticks for ever if this computer dies"),
+        (SIMPLE_NAMES, f"{TURNED}the heading at arming"),
+    ):
+        if missing := [name for name in names if name not in values]:
+            said = f"the vehicle has not sent {', '.join(missing)}: whether {unknown} is not known"
+            yield ParamNote("advice", tuple(missing), said)
     if time_s > _LONGEST_S:
+        held = (
+            ": if this computer died, the vehicle would hold its last sticks for that many seconds"
+        )
+        yield ParamNote.of("advice", "RC_OVERRIDE_TIME", time_s, held, 0.5)
+    landing = values.get("FS_OPTIONS", _CONTINUE_LANDING)
+    if context.has_receiver is False and not int(landing) & _CONTINUE_LANDING:
+        effect = ": without a receiver, a landing turns into RTL when the sticks end"
+        mended = int(landing) | _CONTINUE_LANDING
+        yield ParamNote.of("hint", "FS_OPTIONS", landing, effect, mended)
+    if context.has_receiver and switch is None:
         yield ParamNote(
-            ("RC_OVERRIDE_TIME",),
-            f"RC_OVERRIDE_TIME is {time_s:g}: if this computer died, the vehicle would hold its "
-            "last sticks for that many seconds",
-            "--set RC_OVERRIDE_TIME=0.5",
+            "hint",
+            ("RCn_OPTION",),
+            "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
+            "autopilot itself, whatever happens here",
         )
 
 
-def _setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-    """Yield warnings before a flight by setpoints in GUIDED."""
+def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
+    """Yield what misreads, keeps or weakens setpoints in GUIDED."""
+    if context.output != "velocity":
+        if (options := values.get("GUID_OPTIONS")) is None:
+            said = "it has not sent GUID_OPTIONS, which is asked for again"
+            yield ParamNote("obstacle", ("GUID_OPTIONS",), said)
+        elif not int(options) & _THRUST_AS_THRUST:
+            effect = ", with which it takes our thrust for a climb rate"
+            mended = int(options) | _THRUST_AS_THRUST
+            yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
     timeout_s = values.get("GUID_TIMEOUT", 0.0)
     if timeout_s > _LONGEST_S:
-        yield ParamNote(
-            ("GUID_TIMEOUT",),
-            f"GUID_TIMEOUT is {timeout_s:g}: if this computer died, the vehicle would hold its "
-            "last setpoint for that many seconds",
-            "--set GUID_TIMEOUT=0.5",
+        held = (
+            ": if this computer died, the vehicle would hold its last setpoint for that many "
+            "seconds"
         )
+        yield ParamNote.of("advice", "GUID_TIMEOUT", timeout_s, held, 0.5)
     if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
         yield ParamNote(
+            "advice",
             ("FS_THR_ENABLE",),
             "no receiver was seen: the vehicle will not arm without one while its throttle "
             "failsafe is on; setpoints do not need it",
             "--set FS_THR_ENABLE=0",
         )
     if context.output == "attitude" and values.get("ATC_ANGLE_BOOST") == 0:
-        yield ParamNote(
-            ("ATC_ANGLE_BOOST",),
-            "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it",
-        )
+        effect = ": thrust is not raised when it leans, the policy has to do it"
+        yield ParamNote.of("advice", "ATC_ANGLE_BOOST", 0.0, effect)
 
 
 ARDUPILOT = ArduPilot()

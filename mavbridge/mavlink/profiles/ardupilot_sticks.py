@@ -16,7 +16,7 @@ from mavbridge.mavlink.codec.calibration import (
     RcCalibration,
     RcChannel,
 )
-from mavbridge.mavlink.profiles.profile import StickSetting
+from mavbridge.mavlink.profiles.profile import ParamNote
 from mavbridge.mavlink.profiles.sticks import (
     IDENTITY,
     MAX_DEAD_ZONE,
@@ -181,30 +181,28 @@ def _require(values: Mapping[str, float], name: str) -> float:
     return values[name]
 
 
-def stick_settings(values: Mapping[str, float]) -> Iterator[StickSetting]:
-    """Yield parameters that can turn our sticks, or let them operate a switch.
+def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
+    """Yield parameters that turn our sticks, or let them operate a switch.
 
     The bits of SIMPLE_NAMES belong to positions of the pilot's mode switch, which may move at any
     time. Simple mode turns by the heading at arming, which is not reported and so cannot be mapped.
     """
-    yield StickSetting("SIMPLE", f"{TURNED}the heading at arming", lambda bits: bits == 0, 0)
-    yield StickSetting("SUPER_SIMPLE", f"{TURNED}the way home", lambda bits: bits == 0, 0)
+    for name, turned_by in zip(SIMPLE_NAMES, ("heading at arming", "way home"), strict=True):
+        if bits := values.get(name, 0):
+            yield ParamNote.of("obstacle", name, bits, f": {TURNED}the {turned_by}", 0)
     sticks = {values[name]: name for name in map("RCMAP_{}".format, STICKS) if name in values}
     for number in sorted({*OPTION_CHANNELS, *map(int, sticks)}):
-        name = f"RC{number}_OPTION"
-        if number in sticks:
-            effect = f"the stick of {sticks[number]} would work a switch"
-            yield StickSetting(name, effect, lambda option: option == 0, 0)
-        else:
-            effect = f"with that switch, {TURNED}the heading at arming or of the way home"
-            yield StickSetting(name, effect, lambda option: option not in _SIMPLE_OPTIONS, 0)
-    channel = values.get("FLTMODE_CH", 0)
-    yield StickSetting(
-        "FLTMODE_CH",
-        f"the stick of {sticks.get(channel)} would change the flight mode",
-        lambda number: number not in sticks,
-        next((number for number in range(5, 9) if number not in sticks), 0),
-    )
+        option = values.get(name := f"RC{number}_OPTION", 0)
+        if option and number in sticks:
+            effect = f": the stick of {sticks[number]} would work a switch"
+            yield ParamNote.of("obstacle", name, option, effect, 0)
+        elif option in _SIMPLE_OPTIONS:
+            effect = f": with that switch, {TURNED}the heading at arming or of the way home"
+            yield ParamNote.of("obstacle", name, option, effect, 0)
+    if (channel := values.get("FLTMODE_CH")) in sticks:
+        effect = f": the stick of {sticks[channel]} would change the flight mode"
+        free = next((number for number in range(5, 9) if number not in sticks), 0)
+        yield ParamNote.of("obstacle", "FLTMODE_CH", channel, effect, free)
 
 
 def is_simple_setting(name: str, value: float) -> bool:

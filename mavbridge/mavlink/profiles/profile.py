@@ -2,9 +2,9 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -17,44 +17,29 @@ from mavbridge.mavlink.profiles.sticks import StickCurves
 
 
 class ModeTable:
-    """Names and numbers of flight modes; a main mode with sub-modes has one name for each.
+    """Names and numbers of flight modes.
 
-    ``shift`` and ``sub_shift`` give the position of the 8-bit numbers of main mode and sub-mode in
-    HEARTBEAT.custom_mode; None: the whole number is the mode, without sub-modes. Modes in
-    ``never_commanded`` have only a name.
+    ``names``: name of each HEARTBEAT.custom_mode. ``main_mask``: its bits without the sub-mode; a
+    sub-mode without a name has that of its main mode. ``commands``: parameters 2 and 3 of
+    MAV_CMD_DO_SET_MODE, by name.
     """
 
     def __init__(
         self,
-        names: dict[int, str],
+        names: Mapping[int, str],
+        commands: Mapping[str, tuple[int, int]],
         *,
         roles: ModeRoles,
-        shift: int | None = None,
-        sub_shift: int = 0,
-        sub_modes: dict[str, dict[int, str]] | None = None,
-        never_commanded: tuple[str, ...] = (),
+        main_mask: int = -1,
     ) -> None:
-        self._names = names
-        self._shift, self._sub_shift = shift, sub_shift
-        self._sub_modes = sub_modes or {}
-        self._commands: dict[str, tuple[int, int]] = {}
-        for number, name in names.items():
-            if name in self._sub_modes:
-                subs = self._sub_modes[name].items()
-                self._commands |= {f"{name}.{sub}": (number, code) for code, sub in subs}
-            elif name not in never_commanded:
-                self._commands[name] = (number, 0)
-        self.roles = replace(roles, names=tuple(self._commands))
+        self._names, self._commands, self._main_mask = names, commands, main_mask
+        self.roles = replace(roles, names=tuple(commands))
         """Roles of the modes, and the names of all that can be requested."""
 
     def name(self, custom_mode: int) -> str:
         """Return the name of HEARTBEAT.custom_mode, or its number if it has none."""
-        number = custom_mode if self._shift is None else custom_mode >> self._shift & 0xFF
-        name = self._names.get(number, str(number))
-        if name in self._sub_modes:
-            sub = custom_mode >> self._sub_shift & 0xFF
-            return f"{name}.{self._sub_modes[name].get(sub, sub)}"
-        return name
+        main = self._names.get(custom_mode & self._main_mask, str(custom_mode))
+        return self._names.get(custom_mode, main)
 
     def command(self, name: str) -> tuple[int, int]:
         """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE.
@@ -74,12 +59,12 @@ class StreamGroup(NamedTuple):
     """One quantity, and the messages that carry it, best first."""
 
     messages: tuple[str, ...]
-    stream: int | None
+    rate_hz: float
+    is_needed: bool = False
+    """False if nothing waits for it: a vehicle that does not grant it is flown without."""
+    stream: int | None = None
     """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
     set other messages."""
-    rate_hz: float
-    is_optional: bool = False
-    """True if nothing waits for it: a vehicle that does not grant it is flown without."""
     least_hz: float | None = None
     """Lowest rate of a message that is sent only on change; below it, it is requested again. None:
     the message is periodic, and a fraction of ``rate_hz`` decides."""
@@ -89,24 +74,12 @@ class StreamGroup(NamedTuple):
     """Message to request one at a time during its absence."""
 
 
-def optional_stream(
-    message: str,
-    rate_hz: float,
-    *,
-    least_hz: float | None = None,
-    without: str = "",
-    stand_in: str | None = None,
-) -> StreamGroup:
-    """Return the group of one message that no flight waits for."""
-    return StreamGroup((message,), None, rate_hz, True, least_hz, without, stand_in)
-
-
 NO_LANDING = "a landing does not end the flight"
 NO_POSITION_WORD = "the loss of its position estimate is not seen"
 NO_HEALTH = "a low battery and a receiver that fails are not seen"
 
 
-HOME_HEIGHT = optional_stream("GLOBAL_POSITION_INT", 20.0, least_hz=5.0)
+HOME_HEIGHT = StreamGroup(("GLOBAL_POSITION_INT",), 20.0, least_hz=5.0)
 """Height above home, for policies that take it; fresher than the age limit of a velocity."""
 
 
@@ -122,9 +95,15 @@ class EventMeaning(NamedTuple):
     """Text for the user, if no STATUSTEXT reports it."""
 
 
+NoteKind: TypeAlias = Literal["obstacle", "advice", "hint"]
+"""obstacle: the vehicle would not follow our commands, which the user cannot accept. advice: a
+warning. hint: an improvement, shown only by ``mavbridge check``."""
+
+
 class ParamNote(NamedTuple):
     """Remark about parameters, and the flag that fixes it."""
 
+    kind: NoteKind
     names: tuple[str, ...]
     """Parameters concerned; may be empty."""
     said: str
@@ -132,13 +111,25 @@ class ParamNote(NamedTuple):
     """Flag that fixes it; empty: none."""
     or_else: str = ""
     """End of the sentence, after the flag."""
-    names_cure: bool = False
-    """True if ``said`` already names the flag."""
+
+    @classmethod
+    def of(
+        cls,
+        kind: NoteKind,
+        name: str,
+        value: float,
+        effect: str,
+        mended: float | None = None,
+        or_else: str = "",
+    ) -> "ParamNote":
+        """Return a remark about one value; ``mended``: the value that fixes it."""
+        cure = "" if mended is None else f"--set {name}={mended:g}"
+        return cls(kind, (name,), f"{name} is {value:g}{effect}", cure, or_else)
 
     @property
     def text(self) -> str:
         """Sentence for the user, with the flag."""
-        is_complete = self.names_cure or not self.cure
+        is_complete = self.cure in self.said
         return self.said if is_complete else f"{self.said}: use {self.cure}{self.or_else}"
 
 
@@ -147,67 +138,27 @@ class Danger(NamedTuple):
 
     risk: Risk
     why: Reason
+    """Names the flag that fixes it."""
     name: str | None = None
     """Parameter concerned."""
     cure: str = ""
-    """Flag that fixes it, named in ``why``."""
-
-    @property
-    def accepted(self) -> ParamNote:
-        """Note for a flight whose risk the user has accepted."""
-        return self._note(f"risk {self.risk} is accepted: {self.why}")
-
-    @property
-    def refused(self) -> ParamNote:
-        """Note for a refused flight."""
-        return self._note(str(self.refusal))
 
     @property
     def refusal(self) -> Reason:
         """Reason to refuse a flight."""
         return because(Code.RISK, risk=self.risk, why=self.why)
 
-    def _note(self, said: str) -> ParamNote:
+    def note(self, *, is_accepted: bool) -> ParamNote:
+        """Return a note for a flight that is refused, or whose risk the user has accepted."""
+        accepted = f"risk {self.risk} is accepted: {self.why}"
         names = () if self.name is None else (self.name,)
-        return ParamNote(names, said, self.cure, names_cure=True)
+        if is_accepted:
+            return ParamNote("advice", names, accepted, self.cure)
+        return ParamNote("obstacle", names, str(self.refusal), self.cure)
 
 
-LONGEST_SETPOINT_S = 3.0
+_LONGEST_SETPOINT_S = 3.0
 """Longest time to follow the last setpoint of a dead guard; ArduPilot's default."""
-
-
-def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
-    """Yield a danger if the vehicle's setpoint timeout, parameter ``name`` [s], is long."""
-    time_s = values.get(name, 0.0)
-    if time_s > LONGEST_SETPOINT_S:
-        why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
-        yield Danger("long-setpoint", why, name, f"--set {name}=0.5")
-
-
-class StickSetting(NamedTuple):
-    """Parameter that can change the meaning of a stick."""
-
-    name: str
-    effect: str
-    is_harmless: Callable[[float], bool]
-    mended: float
-
-
-def stick_obstacles(
-    settings: Iterable[StickSetting], values: Mapping[str, float]
-) -> Iterator[ParamNote]:
-    """Yield a note for each setting that changes the meaning of a stick."""
-    for name, effect, is_harmless, mended in settings:
-        value = values.get(name)
-        if value is not None and not is_harmless(value):
-            yield ParamNote((name,), f"{name} is {value:g}: {effect}", f"--set {name}={mended:g}")
-
-
-class WantedParam(NamedTuple):
-    """Parameter that a flight depends on, and its required value in words, for the user."""
-
-    name: str
-    should_be: str
 
 
 class ParamContext(NamedTuple):
@@ -239,6 +190,16 @@ class Profile(ABC):
     """True if LOCAL_POSITION_NED also comes without a valid estimate: see the estimator's flags."""
     shows_rates: ClassVar[bool] = False
     """True if ATTITUDE_TARGET shows body rates as sent, but not their thrust."""
+    setpoint_timeout: ClassVar[str]
+    """Parameter of the time for which the last setpoint is followed [s]."""
+    target_hz: ClassVar[float]
+    """Rate of ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED for the echo check."""
+    stick_echo: ClassVar[StreamGroup]
+    """Message that shows the sticks that the vehicle acts on."""
+    hover_param: ClassVar[str]
+    """Parameter of the hover thrust."""
+    boost_param: ClassVar[str | None] = None
+    """Parameter that is not 0 if thrust is raised in a lean; None: it never is."""
     has_rc_channels_always: ClassVar[bool] = True
     """True if RC_CHANNELS also comes without a receiver."""
     events: ClassVar[Mapping[int, EventMeaning]] = {}
@@ -253,19 +214,19 @@ class Profile(ABC):
         ``pilot_hz``: rate of RC_CHANNELS; None: the default.
         """
 
-    @abstractmethod
     def echo(self, output: Output) -> StreamGroup:
         """Return the message that shows the echo of this output.
 
         It may be one of ``streams``, with the same rate.
         """
-
-    def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return parameters to read because of the values of others."""
-        return ()
+        if output in ("attitude", "rates"):
+            return StreamGroup(("ATTITUDE_TARGET",), self.target_hz)
+        if output == "velocity":
+            return StreamGroup(("POSITION_TARGET_LOCAL_NED",), self.target_hz, least_hz=0.0)
+        return self.stick_echo
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return parameters that are requested on the ground until they arrive."""
+        """Return more parameters, by values of others; asked for on the ground until they come."""
         return ()
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration | None:
@@ -284,34 +245,25 @@ class Profile(ABC):
         """True if the vehicle ignores the sticks of a receiver, even if there is one."""
         return False
 
-    @abstractmethod
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield settings under which the vehicle would not follow our commands.
-
-        Each comes with the command that fixes it; the user cannot accept them.
-        """
-
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
         """Return the command that a parameter change for a flight needs to take effect, or None."""
         return None
 
     @abstractmethod
+    def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
+        """Yield settings that prevent, weaken or change a flight, each with its remedy."""
+
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
         """Yield settings with which it flies, but not safely, including accepted ones."""
+        name, time_s = self.setpoint_timeout, values.get(self.setpoint_timeout, 0.0)
+        is_setpoint = context.output not in (None, self.outputs["sticks"])
+        if is_setpoint and time_s > _LONGEST_SETPOINT_S:
+            why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
+            yield Danger("long-setpoint", why, name, f"--set {name}=0.5")
 
     @abstractmethod
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield warnings that do not forbid a flight."""
-
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield possible improvements with their commands; shown only by ``mavbridge check``."""
-        return iter(())
-
-    @abstractmethod
-    def wanted_params(
-        self, values: Mapping[str, float], context: ParamContext
-    ) -> Iterator[WantedParam]:
-        """Yield the parameters to show before a flight; the methods above judge the values."""
+    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
+        """Return the parameters that a flight depends on, with their required values in words."""
 
     @abstractmethod
     def stick_curves(
@@ -322,13 +274,13 @@ class Profile(ABC):
         Request it again when parameters or the mode change. ``gains`` None: sticks stay unchanged.
         """
 
-    @abstractmethod
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
         """Return the hover thrust in [0, 1] by the vehicle's own estimate; None: unknown."""
+        return values.get(self.hover_param)
 
     def boosts_thrust(self, values: Mapping[str, float]) -> bool:
         """True if the vehicle divides a setpoint's thrust by the cosine of its tilt."""
-        return False
+        return self.boost_param is not None and values.get(self.boost_param, 1.0) != 0
 
     def hand_per_s(self, values: Mapping[str, float]) -> float:
         """Return the stick speed that ends an autonomous mode [full sticks/s]."""

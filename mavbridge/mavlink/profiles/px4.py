@@ -1,8 +1,13 @@
-"""Profile of PX4's multicopters, measured on 1.18."""
+"""Profile of PX4's multicopters, measured on 1.18.
+
+Formulas of sticks: PX4's ``Sticks``, ``StickTiltXY``, ``StickYaw``, ``FlightTaskManualAltitude``
+and, for STABILIZED, ``mc_att_control``. The tests compare them with leans and rates measured on the
+firmware.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -12,21 +17,24 @@ from mavbridge.mavlink.profiles.profile import (
     NO_HEALTH,
     NO_LANDING,
     NO_POSITION_WORD,
-    Danger,
     EventMeaning,
     ModeTable,
     ParamContext,
     ParamNote,
     Profile,
-    StickSetting,
     StreamGroup,
-    WantedParam,
-    optional_stream,
-    setpoint_danger,
-    stick_obstacles,
 )
-from mavbridge.mavlink.profiles.px4_sticks import px4_curves
-from mavbridge.mavlink.profiles.sticks import StickCurves
+from mavbridge.mavlink.profiles.sticks import (
+    IDENTITY,
+    MAX_DEAD_ZONE,
+    Axis,
+    Bend,
+    Half,
+    Lean,
+    StickCurves,
+    curves_between,
+    unusable,
+)
 
 CURRENT_MODE_HZ = 50.0
 """Shows a mode change within 30 ms; the unrequested rate is 2 Hz."""
@@ -39,17 +47,8 @@ FAST_HZ = 250.0
 requested become 125 Hz, 250 Hz become 205 to 250 Hz."""
 _UNEVEN_HZ = 150.0
 """Rate above which a request for the rate itself yields less than one for ``FAST_HZ``."""
-_TARGET_HZ = 100.0
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
 """Values of COM_RC_IN_MODE that exclude MAVLink's sticks."""
-_STICK_SETTINGS = (
-    StickSetting(
-        "MAN_KILL_GEST_T",
-        "both sticks held down and outwards stop the motors, in flight too",
-        lambda time_s: time_s < 0,
-        -1,
-    ),
-)
 _NO_RESCALE = 1
 """Value of MPC_THR_CURVE."""
 _FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
@@ -65,14 +64,24 @@ lose a few packets in a row."""
 _SLOWEST_HAND_PER_S = 0.05
 """Default if neither parameter was read: the minimum of COM_RC_STICK_OV, 5 %."""
 
-_FIRST_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
-_AUTO_MODES = ("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
+_MAIN_MODES = {
+    **dict(
+        enumerate(("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED"), start=1)
+    ),
+    10: "TERMINATION",
+    11: "ALTITUDE_CRUISE",
+}
+_AUTO, _AUTO_MODES = 4, enumerate(("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND"), start=2)
+_COMMANDS = {
+    name: (number, 0)
+    for number, name in _MAIN_MODES.items()
+    if name not in ("AUTO", "TERMINATION")  # without a sub-mode, and never
+} | {f"AUTO.{name}": (_AUTO, sub) for sub, name in _AUTO_MODES}
 _MODES = ModeTable(
-    {
-        **dict(enumerate(_FIRST_MODES, start=1)),
-        10: "TERMINATION",
-        11: "ALTITUDE_CRUISE",
-    },
+    {main << 16: name for main, name in _MAIN_MODES.items()}
+    | {main << 16 | sub << 24: name for name, (main, sub) in _COMMANDS.items()},
+    _COMMANDS,
+    main_mask=0xFF << 16,
     roles=ModeRoles(
         hold="AUTO.LOITER",
         land="AUTO.LAND",
@@ -85,10 +94,6 @@ _MODES = ModeTable(
         override="POSCTL",
         needs_sticks_first=True,
     ),
-    shift=16,
-    sub_shift=24,
-    sub_modes={"AUTO": dict(enumerate(_AUTO_MODES, start=2))},
-    never_commanded=("TERMINATION",),
 )
 
 
@@ -117,6 +122,36 @@ _EVENTS = {
 }
 
 
+EXPO = 0.6
+"""Expo of the yaw and climb sticks: cubic fraction; the default of older versions too."""
+_LEAN_MODES = ("ALTCTL", "STABILIZED")
+"""Modes in which sticks are a lean and a yaw rate."""
+_CLIMB_MODE = "ALTCTL"
+_MAX_TILT_DEG = 89.0
+_LEAST_EXPO = 1e-3
+"""Expo below which the curve counts as a straight line."""
+_LEAST_LINEAR = 1e-9
+"""Linear fraction below which the curve counts as a cube."""
+
+
+class CubicExpo(NamedTuple):
+    """Expo curve (1 - e) x + e x^3."""
+
+    expo: float
+
+    def bent(self, share: float) -> float:
+        """Return the fraction of the motion at this fraction of the stick."""
+        return share * (1.0 - self.expo + self.expo * share * share)
+
+    def straightened(self, share: float) -> float:
+        """Return the fraction of the stick: the real root, by Cardano's hyperbolic formula."""
+        linear = 1.0 - self.expo
+        if linear < _LEAST_LINEAR:
+            return math.cbrt(share)
+        root = math.sqrt(linear / (3.0 * self.expo))
+        return 2.0 * root * math.sinh(math.asinh(1.5 * share / (linear * root)) / 3.0)
+
+
 class Px4(Profile):
     """PX4, as measured: sticks as MANUAL_CONTROL, setpoints in OFFBOARD."""
 
@@ -140,6 +175,11 @@ class Px4(Profile):
     }
     sends_invalid_estimates = True
     shows_rates = True
+    setpoint_timeout = "COM_OF_LOSS_T"
+    target_hz = 100.0
+    stick_echo = StreamGroup(("MANUAL_CONTROL",), FAST_HZ, least_hz=0.0)
+    """Shows the selected sticks at the sender's rate."""
+    hover_param = "MPC_THR_HOVER"
     params = (
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
@@ -159,31 +199,23 @@ class Px4(Profile):
         fast_hz = state_hz if state_hz <= _UNEVEN_HZ else FAST_HZ
         slow_hz = min(state_hz, POSITION_CEILING_HZ)
         return (
-            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), None, fast_hz),
-            StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
-            StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
-            optional_stream(
-                "CURRENT_MODE",
+            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), fast_hz, is_needed=True),
+            StreamGroup(("LOCAL_POSITION_NED",), slow_hz, is_needed=True),
+            StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), fast_hz, is_needed=True),
+            StreamGroup(
+                ("CURRENT_MODE",),
                 CURRENT_MODE_HZ,
                 least_hz=1.0,
                 without="PX4 before 1.15, or MAVLink 1; a takeover shows in HEARTBEAT, which is "
                 "asked for 20 times a second",
                 stand_in="HEARTBEAT",
             ),
-            optional_stream("RC_CHANNELS", pilot_hz or RC_CHANNELS_HZ, least_hz=0.0),
-            optional_stream("SYS_STATUS", 2.0, without=NO_HEALTH),
-            optional_stream("EXTENDED_SYS_STATE", 5.0, without=NO_LANDING),
-            optional_stream("ESTIMATOR_STATUS", 5.0, without=NO_POSITION_WORD),
-            optional_stream("GLOBAL_POSITION_INT", 2.0, least_hz=0.0),
+            StreamGroup(("RC_CHANNELS",), pilot_hz or RC_CHANNELS_HZ, least_hz=0.0),
+            StreamGroup(("SYS_STATUS",), 2.0, without=NO_HEALTH),
+            StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without=NO_LANDING),
+            StreamGroup(("ESTIMATOR_STATUS",), 5.0, without=NO_POSITION_WORD),
+            StreamGroup(("GLOBAL_POSITION_INT",), 2.0, least_hz=0.0),
         )
-
-    def echo(self, output: Output) -> StreamGroup:
-        """See `Profile`. MANUAL_CONTROL shows the selected sticks at the sender's rate."""
-        if output in ("attitude", "rates"):
-            return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
-        if output == "velocity":
-            return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, least_hz=0.0)
-        return optional_stream("MANUAL_CONTROL", FAST_HZ, least_hz=0.0)
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Return the parameters for the source of sticks and for hover thrust."""
@@ -193,109 +225,68 @@ class Px4(Profile):
         """True if COM_RC_IN_MODE is 1 (sticks only from MAVLink) or 4 (no sticks)."""
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield a COM_RC_IN_MODE without MAVLink's sticks, and a gesture a policy might make."""
-        if context.output != "manual-control":
-            return
-        yield from stick_obstacles(_STICK_SETTINGS, values)
-        mode = values.get("COM_RC_IN_MODE")
-        if mode in _NO_MAVLINK_STICKS:
-            yield ParamNote(
-                ("COM_RC_IN_MODE",),
-                f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]})",
-                "--set COM_RC_IN_MODE=1",
-                " (MAVLink only), or 6 with a receiver (MAVLink first)",
-            )
-
-    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Yield long setpoint timeouts; the end of sticks is always a failsafe."""
-        if context.output not in (None, "manual-control"):
-            yield from setpoint_danger(values, "COM_OF_LOSS_T")
-
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield unexpected effects of the end of our packets."""
+    def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
+        """See `Profile`."""
         if context.output == "manual-control":
-            name, action = "COM_RC_LOSS_T", _FATAL_ACTIONS.get(int(values.get("NAV_RCL_ACT", 2)))
-            act_name = "NAV_RCL_ACT"
-            yield from _stick_advice(values)
+            yield from _stick_notes(values)
+            yield from _end_notes(values, "COM_RC_LOSS_T", "NAV_RCL_ACT", _FATAL_ACTIONS)
+            yield from _exception_notes(values, _EXCEPT_HOLD, "AUTO")
         elif context.output is not None:
-            name, act_name = "COM_OF_LOSS_T", "COM_OBL_RC_ACT"
-            action = _FATAL_OFFBOARD_ACTIONS.get(int(values.get(act_name, 0)))
-        else:
-            return
-        time_s = values.get(name, _LONGEST_S)
-        if time_s > _LONGEST_S:
-            yield ParamNote(
-                (name,),
-                f"{name} is {time_s:g}: if this computer died, the vehicle would go on with the "
-                "last it was told for that many seconds",
-                f"--set {name}=0.5",
+            yield from _end_notes(
+                values, "COM_OF_LOSS_T", "COM_OBL_RC_ACT", _FATAL_OFFBOARD_ACTIONS
             )
-        if time_s < _SHORTEST_S:
-            yield ParamNote(
-                (name,),
-                f"{name} is {time_s:g}: a pause of our packets as short as that is a failsafe",
-            )
-        if action is not None:
-            yield ParamNote(
-                (act_name,),
-                f"{act_name} is {values[act_name]:g}: it would {action} if our packets stopped",
-            )
+            yield from _exception_notes(values, _EXCEPT_OFFBOARD, "OFFBOARD")
+            if values.get("COM_OBL_RC_ACT") == 0:
+                effect = ": when setpoints end it enters POSCTL if there are sticks, else RTL"
+                yield ParamNote.of("hint", "COM_OBL_RC_ACT", 0, effect, 4, " (land), or 5 (hold)")
 
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield settings by which lost sticks end other modes, and the gesture that arms."""
-        exceptions = values.get("COM_RCL_EXCEPT")
-        is_sticks = context.output == "manual-control"
-        bit, mode = (_EXCEPT_HOLD, "AUTO") if is_sticks else (_EXCEPT_OFFBOARD, "OFFBOARD")
-        if exceptions is not None and not int(exceptions) & bit:
-            yield ParamNote(
-                ("COM_RCL_EXCEPT",),
-                f"COM_RCL_EXCEPT is {exceptions:g}: sticks that were there at arming and end later "
-                f"are a failsafe in {mode} modes too",
-                f"--set COM_RCL_EXCEPT={int(exceptions) | bit}",
-            )
-        if is_sticks and values.get("MAN_ARM_GESTURE") == 1:
-            yield ParamNote(
-                ("MAN_ARM_GESTURE",),
-                "MAN_ARM_GESTURE is 1: throttle down and full yaw for a second arms, which a "
-                "policy on the ground might do",
-                "--set MAN_ARM_GESTURE=0",
-            )
-        if not is_sticks and values.get("COM_OBL_RC_ACT") == 0:
-            yield ParamNote(
-                ("COM_OBL_RC_ACT",),
-                "COM_OBL_RC_ACT is 0: when setpoints end it enters POSCTL if there are sticks, "
-                "else RTL",
-                "--set COM_OBL_RC_ACT=4",
-                " (land), or 5 (hold)",
-            )
-
-    def wanted_params(
-        self, values: Mapping[str, float], context: ParamContext
-    ) -> Iterator[WantedParam]:
-        """Yield the parameters for sticks, or for setpoints."""
+    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
+        """See `Profile`."""
         time = f"0.5; {_SHORTEST_S:g} to {_LONGEST_S:g} s"
         if context.output == "manual-control":
-            yield WantedParam("COM_RC_IN_MODE", "1, or 6 with a receiver")
-            yield WantedParam("COM_RC_LOSS_T", time)
-            yield WantedParam("NAV_RCL_ACT", "1, 2 or 3 (hold, return, land)")
-            yield WantedParam("COM_RCL_EXCEPT", f"with {_EXCEPT_HOLD} in it")
-            yield WantedParam("MAN_ARM_GESTURE", "0")
-            yield WantedParam("COM_DISARM_PRFLT", "longer than it takes to lift off")
-        else:
-            yield WantedParam("COM_OF_LOSS_T", time)
-            yield WantedParam("COM_OBL_RC_ACT", "4 or 5 (land, hold)")
-            yield WantedParam("COM_RCL_EXCEPT", f"with {_EXCEPT_OFFBOARD} in it")
+            return {
+                "COM_RC_IN_MODE": "1, or 6 with a receiver",
+                "COM_RC_LOSS_T": time,
+                "NAV_RCL_ACT": "1, 2 or 3 (hold, return, land)",
+                "COM_RCL_EXCEPT": f"with {_EXCEPT_HOLD} in it",
+                "MAN_ARM_GESTURE": "0",
+                "COM_DISARM_PRFLT": "longer than it takes to lift off",
+            }
+        return {
+            "COM_OF_LOSS_T": time,
+            "COM_OBL_RC_ACT": "4 or 5 (land, hold)",
+            "COM_RCL_EXCEPT": f"with {_EXCEPT_OFFBOARD} in it",
+        }
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
-        """Return the curves of lean, yaw rate and climb rate in ALTCTL and STABILIZED."""
-        return px4_curves(values, mode, gains)
+        """See `Profile`.
 
-    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """Return MPC_THR_HOVER."""
-        return values.get("MPC_THR_HOVER")
+        ALTCTL maps all sticks, STABILIZED all but the throttle, which is thrust there. In other
+        modes sticks have meanings that ``gains`` does not cover: a speed in POSCTL, a body rate in
+        ACRO.
+        """
+        if gains is None or mode not in _LEAN_MODES:
+            return IDENTITY
+        dead_zone = "MPC_HOLD_DZ" if "MPC_HOLD_DZ" in values else "MAN_DEADZONE"
+        positive = ("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN")
+        needed = (*positive, dead_zone)
+        if (nothing := unusable(values, needed=needed, positive=positive)) is not None:
+            return nothing
+        start = min(max(values[dead_zone], 0.0), MAX_DEAD_ZONE)
+        climb = _expo(values, "MPC_Z_MAN_EXPO")
+
+        def half(parameter: str, bend: Bend | None) -> Half:
+            return Half(values[parameter], start, bend=bend, parameter=parameter)
+
+        throttle = Axis(half("MPC_Z_VEL_MAX_UP", climb), half("MPC_Z_VEL_MAX_DN", climb))
+        return curves_between(
+            gains,
+            throttle=throttle if mode == _CLIMB_MODE else None,
+            yaw=Axis.even(half("MPC_MAN_Y_MAX", _expo(values, "MPC_YAW_EXPO"))),
+            lean=_lean(values["MPC_MAN_TILT_MAX"], is_tangent=mode == _CLIMB_MODE),
+        )
 
     def hand_per_s(self, values: Mapping[str, float]) -> float:
         """See `Profile`. 1.18 has MAN_OVERRIDE_SPD (negative: off).
@@ -326,23 +317,81 @@ class Px4(Profile):
         )
 
 
-def _stick_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """Yield settings that weaken or change a stick in one mode."""
+def _expo(values: Mapping[str, float], name: str) -> Bend | None:
+    expo = min(max(values.get(name, EXPO), 0.0), 1.0)
+    return CubicExpo(expo) if expo >= _LEAST_EXPO else None
+
+
+def _lean(tilt_deg: float, *, is_tangent: bool) -> Lean:
+    """Return the lean: no dead zone; an acceleration in ALTCTL, a tilt in STABILIZED."""
+    tilt_deg = min(tilt_deg, _MAX_TILT_DEG)
+    full = math.tan(math.radians(tilt_deg)) if is_tangent else tilt_deg
+    axis = Axis.even(Half(full))
+    return Lean(axis, axis, full, is_tangent, "MPC_MAN_TILT_MAX")
+
+
+def _stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
+    """Yield settings that refuse, weaken or change sticks, and gestures a policy might make."""
+    if (time_s := values.get("MAN_KILL_GEST_T", -1.0)) >= 0:
+        effect = ": both sticks held down and outwards stop the motors, in flight too"
+        yield ParamNote.of("obstacle", "MAN_KILL_GEST_T", time_s, effect, -1)
+    mode = values.get("COM_RC_IN_MODE", 1.0)
+    if mode in _NO_MAVLINK_STICKS:
+        yield ParamNote.of(
+            "obstacle",
+            "COM_RC_IN_MODE",
+            mode,
+            f" ({_NO_MAVLINK_STICKS[int(mode)]})",
+            1,
+            " (MAVLink only), or 6 with a receiver (MAVLink first)",
+        )
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
-        yield ParamNote(
-            ("MPC_TILTMAX_AIR",),
-            f"MPC_TILTMAX_AIR is {limit_deg:g}: in ALTCTL it leans no further, and full stick is "
-            f"{full_deg:g} deg (MPC_MAN_TILT_MAX)",
-            f"--set MPC_TILTMAX_AIR={full_deg:g}",
+        effect = (
+            f": in ALTCTL it leans no further, and full stick is {full_deg:g} deg "
+            "(MPC_MAN_TILT_MAX)"
         )
+        yield ParamNote.of("advice", "MPC_TILTMAX_AIR", limit_deg, effect, full_deg)
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
-        yield ParamNote(
-            ("MPC_THR_CURVE",),
-            "MPC_THR_CURVE is 1: in STABILIZED the middle of the throttle is half of full thrust, "
-            "and not hover thrust",
-            "--set MPC_THR_CURVE=0",
+        effect = (
+            ": in STABILIZED the middle of the throttle is half of full thrust, and not hover "
+            "thrust"
         )
+        yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
+    if values.get("MAN_ARM_GESTURE") == 1:
+        effect = (
+            ": throttle down and full yaw for a second arms, which a policy on the ground might do"
+        )
+        yield ParamNote.of("hint", "MAN_ARM_GESTURE", 1, effect, 0)
+
+
+def _end_notes(
+    values: Mapping[str, float], time: str, action: str, fatal: Mapping[int, str]
+) -> Iterator[ParamNote]:
+    """Yield unexpected effects of the end of our packets, by two parameters."""
+    time_s = values.get(time, _LONGEST_S)
+    if time_s > _LONGEST_S:
+        effect = (
+            ": if this computer died, the vehicle would go on with the last it was told for that "
+            "many seconds"
+        )
+        yield ParamNote.of("advice", time, time_s, effect, 0.5)
+    if time_s < _SHORTEST_S:
+        effect = ": a pause of our packets as short as that is a failsafe"
+        yield ParamNote.of("advice", time, time_s, effect)
+    if (value := values.get(action, 0.0)) in fatal:
+        effect = f": it would {fatal[int(value)]} if our packets stopped"
+        yield ParamNote.of("advice", action, value, effect)
+
+
+def _exception_notes(values: Mapping[str, float], bit: int, mode: str) -> Iterator[ParamNote]:
+    """Yield a hint if lost sticks are a failsafe in these modes too."""
+    exceptions = values.get("COM_RCL_EXCEPT", bit)
+    if not int(exceptions) & bit:
+        effect = (
+            f": sticks that were there at arming and end later are a failsafe in {mode} modes too"
+        )
+        yield ParamNote.of("hint", "COM_RCL_EXCEPT", exceptions, effect, int(exceptions) | bit)
 
 
 PX4 = Px4()

@@ -1,12 +1,12 @@
 """Stick curves, and the map from a policy's sticks to a vehicle's that cause the same motion.
 
 A curve gives the motion that a stick commands. The policy's curves come from its contract
-(``StickGains``), the vehicle's from its parameters (`ardupilot_sticks`, `px4_sticks`). A stick is
+(``StickGains``), the vehicle's from its parameters (`ardupilot_sticks`, `px4`). A stick is
 mapped to a motion by the policy's curve, and back to a stick by the inverse of the vehicle's curve.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
@@ -93,6 +93,11 @@ class Axis(NamedTuple):
         """Return the stick for a motion."""
         return self.above.travel(motion) if motion >= 0.0 else -self.below.travel(-motion)
 
+    def reaches(self, motion: float) -> bool:
+        """True if the motion is within the axis."""
+        half = self.above if motion >= 0.0 else self.below
+        return abs(motion) <= half.full * (1.0 + _ROUNDING)
+
     def is_like(self, policy: "Axis") -> bool:
         """True if both halves are close to the policy's."""
         return self.above.is_like(policy.above) and self.below.is_like(policy.below)
@@ -101,19 +106,6 @@ class Axis(NamedTuple):
     def even(cls, half: Half) -> "Axis":
         """Return an axis with this half in both directions."""
         return cls(half, half)
-
-
-class AxisMap(NamedTuple):
-    """Map of the throttle (m/s, + up) or the yaw (degrees/s, + nose right)."""
-
-    policy: Axis
-    vehicle: Axis
-
-    def saturates(self, stick: float) -> bool:
-        """True if the policy's stick demands more than the vehicle can do."""
-        motion = self.policy.motion(stick)
-        half = self.vehicle.above if motion >= 0.0 else self.vehicle.below
-        return abs(motion) > half.full * (1.0 + _ROUNDING)
 
 
 class Lean(NamedTuple):
@@ -156,18 +148,6 @@ class Lean(NamedTuple):
         return self.pitch.stick(pitch), self.roll.stick(roll)
 
 
-class LeanMap(NamedTuple):
-    """Map of pitch and roll."""
-
-    policy: Lean
-    vehicle: Lean
-
-    def saturates(self, pitch: float, roll: float) -> bool:
-        """True if the policy's sticks demand more lean than the vehicle has."""
-        asked = self.vehicle.in_own_unit(*self.policy.motion_deg(pitch, roll))
-        return math.hypot(*asked) > self.vehicle.full * (1.0 + _ROUNDING)
-
-
 def _within(full: float, pitch: float, roll: float) -> tuple[float, float]:
     """Shorten a vector to at most ``full``, keeping its direction."""
     length = math.hypot(pitch, roll)
@@ -176,7 +156,27 @@ def _within(full: float, pitch: float, roll: float) -> tuple[float, float]:
     return pitch * full / length, roll * full / length
 
 
-Quantity = Literal["climb", "descent", "yaw rate", "lean"]
+class Extent(NamedTuple):
+    """Motion at full stick of the policy and of the vehicle."""
+
+    noun: str
+    verb: str
+    unit: str
+    policy: Half
+    vehicle: Half
+    is_mapped: bool
+
+    @property
+    def shortfall(self) -> str | None:
+        """Sentence if the vehicle falls short of the policy, else None."""
+        most = self.vehicle.full
+        if most >= self.policy.full * (1.0 - SAME_GAIN):
+            return None
+        return (
+            f"full {self.noun} of the policy is {self.policy.full:.3g} {self.unit} and this "
+            f"vehicle {self.verb} {most:.3g} {self.unit} at most ({self.vehicle.parameter}): "
+            f"beyond {self.policy.travel(most):.2f} of the stick it does less"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,18 +187,19 @@ class StickCurves:
     meaning from the policy's training.
     """
 
-    throttle: AxisMap | None = None
-    yaw: AxisMap | None = None
-    lean: LeanMap | None = None
-    shortfalls: tuple[tuple[Quantity, str], ...] = ()
-    """Quantities in which the vehicle falls short of the policy, each with a sentence."""
+    throttle: tuple[Axis, Axis] | None = None
+    """The policy's climb rate (m/s, + up) and the vehicle's."""
+    yaw: tuple[Axis, Axis] | None = None
+    """Yaw rates in degrees/s, + nose right."""
+    lean: tuple[Lean, Lean] | None = None
+    extents: tuple[Extent, ...] = ()
     unmapped: str | None = None
     """Why nothing is mapped although it should be, or None."""
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the user at the start."""
-        return (*filter(None, [self.unmapped]), *(text for _, text in self.shortfalls))
+        return tuple(filter(None, [self.unmapped, *(each.shortfall for each in self.extents)]))
 
     @property
     def is_identity(self) -> bool:
@@ -235,15 +236,17 @@ class StickCurves:
 
     def saturated(self, sticks: Sticks) -> tuple[str, ...]:
         """Return the names of sticks that demand more than the vehicle can do, in Sticks' order."""
+        throttle, yaw, pitch, roll = sticks
         names: tuple[str, ...] = ()
-        if self.throttle is not None and self.throttle.saturates(sticks.throttle):
-            names += ("throttle",)
-        if self.yaw is not None and self.yaw.saturates(sticks.yaw):
-            names += ("yaw",)
-        if self.lean is not None and self.lean.saturates(sticks.pitch, sticks.roll):
-            motion = self.lean.policy.pitch.motion
-            names += ("pitch",) if motion(sticks.pitch) else ()
-            names += ("roll",) if motion(sticks.roll) else ()
+        for name, stick, axes in (("throttle", throttle, self.throttle), ("yaw", yaw, self.yaw)):
+            if axes is not None and not axes[1].reaches(axes[0].motion(stick)):
+                names += (name,)
+        if self.lean is not None:
+            policy, vehicle = self.lean
+            asked = vehicle.in_own_unit(*policy.motion_deg(pitch, roll))
+            if math.hypot(*asked) > vehicle.full * (1.0 + _ROUNDING):
+                names += ("pitch",) if policy.pitch.motion(pitch) else ()
+                names += ("roll",) if policy.roll.motion(roll) else ()
         return names
 
 
@@ -261,48 +264,32 @@ def curves_between(
         yaw: yaw rate [degrees/s], + nose right.
         lean: lean of the vehicle.
     """
-    turns = AxisMap(Axis.even(Half(gains.yaw_rate_degps, gains.yaw_dead_zone)), yaw)
+    turn = Axis.even(Half(gains.yaw_rate_degps, gains.yaw_dead_zone))
     leans = Axis.even(Half(gains.lean_deg, gains.lean_dead_zone))
-    leaning = LeanMap(Lean(leans, leans, gains.lean_deg), lean)
-    climbs = None
-    if throttle is not None:
-        dead_zone = gains.throttle_dead_zone
-        climb, descent = Half(gains.climb_mps, dead_zone), Half(gains.descent_mps, dead_zone)
-        climbs = AxisMap(Axis(climb, descent), throttle)
+    leaning = Lean(leans, leans, gains.lean_deg)
+    dead_zone = gains.throttle_dead_zone
+    climbing = Axis(Half(gains.climb_mps, dead_zone), Half(gains.descent_mps, dead_zone))
+    climbs = None if throttle is None or throttle.is_like(climbing) else (climbing, throttle)
+    turns = None if yaw.is_like(turn) else (turn, yaw)
+    lean_map = None if lean.is_like(leaning) else (leaning, lean)
+    up, down = throttle or (None, None)
+    leant = Half(lean.full_deg, parameter=lean.parameter)
+    extents = (
+        ("climb", "climbs", "m/s", climbing.above, up, climbs),
+        ("descent", "descends", "m/s", climbing.below, down, climbs),
+        ("yaw rate", "turns", "deg/s", turn.above, yaw.above, turns),
+        ("lean", "leans", "deg", leans.above, leant, lean_map),
+    )
     return StickCurves(
-        throttle=None if climbs is None or climbs.vehicle.is_like(climbs.policy) else climbs,
-        yaw=None if yaw.is_like(turns.policy) else turns,
-        lean=None if lean.is_like(leaning.policy) else leaning,
-        shortfalls=tuple(_notes(climbs, turns, leaning)),
+        throttle=climbs,
+        yaw=turns,
+        lean=lean_map,
+        extents=tuple(
+            Extent(noun, verb, unit, policy, vehicle, found is not None)
+            for noun, verb, unit, policy, vehicle, found in extents
+            if vehicle is not None
+        ),
     )
-
-
-def _notes(throttle: AxisMap | None, yaw: AxisMap, lean: LeanMap) -> Iterator[tuple[Quantity, str]]:
-    if throttle is not None:
-        up, down = throttle.vehicle
-        yield from _note("climb", "climbs", "m/s", throttle.policy.above, up.full, up.parameter)
-        yield from _note(
-            "descent", "descends", "m/s", throttle.policy.below, down.full, down.parameter
-        )
-    right = yaw.vehicle.above
-    yield from _note("yaw rate", "turns", "deg/s", yaw.policy.above, right.full, right.parameter)
-    policy, vehicle = lean
-    yield from _note(
-        "lean", "leans", "deg", policy.pitch.above, vehicle.full_deg, vehicle.parameter
-    )
-
-
-def _note(
-    noun: Quantity, verb: str, unit: str, policy: Half, most: float, parameter: str
-) -> Iterator[tuple[Quantity, str]]:
-    """Yield a sentence if the vehicle falls short of the policy's full stick."""
-    if most < policy.full * (1.0 - SAME_GAIN):
-        yield (
-            noun,
-            f"full {noun} of the policy is {policy.full:.3g} {unit} and this vehicle {verb} "
-            f"{most:.3g} {unit} at most ({parameter}): beyond {policy.travel(most):.2f} of the "
-            "stick it does less",
-        )
 
 
 def unusable(

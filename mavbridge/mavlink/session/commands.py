@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.vehicle import AdviceText
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
@@ -16,8 +17,7 @@ cost a second."""
 _SET_MODE = dialect.MAV_CMD_DO_SET_MODE
 _ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 _FORGET_NS = 3 * NS_PER_S
-"""Time without requests for a mode after which its refusal is forgotten; time between two
-explanations of a missing takeoff."""
+"""Time without requests for a mode after which its refusal is forgotten."""
 
 
 def mode_request(numbers: tuple[int, int]) -> CommandRequest:
@@ -38,13 +38,12 @@ class VehicleCommands:
         self._vehicle: VehicleSession | None = None
         self._sent: dict[int, tuple[int, CommandRequest]] = {}
         self._mode: str | None = None
-        self._explained_ns: int | None = None
         self.refused_mode: str | None = None
         """Mode of the last request if the vehicle has refused it, else None."""
 
     def adopt(self, vehicle: VehicleSession) -> None:
         """Switch to a new session of the vehicle, to which nothing was sent yet."""
-        self._vehicle, self._mode, self.refused_mode, self._explained_ns = vehicle, None, None, None
+        self._vehicle, self._mode, self.refused_mode = vehicle, None, None
         self._sent.clear()
 
     def set_mode(self, mode: str) -> None:
@@ -75,9 +74,9 @@ class VehicleCommands:
         request = self._vehicle.profile.takeoff(height_m, self._vehicle.condition.amsl_m(now_ns))
         if request is not None:
             self._request(request)
-        elif self._explained_ns is None or now_ns - self._explained_ns >= _FORGET_NS:
-            self._explained_ns = now_ns
-            self._report("no takeoff yet: the vehicle does not tell its height above the sea")
+        else:
+            unknown = "no takeoff yet: the vehicle does not tell its height above the sea"
+            self._report(AdviceText(unknown))
 
     def _request(self, request: CommandRequest) -> None:
         now_ns = self._clock.now_ns()

@@ -1,7 +1,6 @@
 """Condition of the vehicle apart from its motion: mode, receiver, estimator, landing, battery."""
 
-import sys
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -11,6 +10,7 @@ from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
     Altitude,
+    Body,
     CurrentMode,
     EstimatorFlags,
     Event,
@@ -23,17 +23,6 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.profiles.profile import Profile
 
 _T = TypeVar("_T")
-ConditionMessage: TypeAlias = (
-    Heartbeat
-    | CurrentMode
-    | Event
-    | LocalVelocity
-    | Altitude
-    | SystemStatus
-    | LandedState
-    | EstimatorFlags
-)
-
 SETTLE_NS = 100 * NS_PER_MS
 """Time after a change reported by CURRENT_MODE or an EVENT in which a HEARTBEAT may predate it: the
 autopilot reports the change before its heartbeats show it, and a network may swap packets."""
@@ -41,6 +30,8 @@ autopilot reports the change before its heartbeats show it, and a network may sw
 POSITION_FRESH_NS = 500 * NS_PER_MS
 SLOW_FRESH_NS = 2 * NS_PER_S
 """Maximum age of landed state, estimator and battery, which arrive at 5 and 2 Hz."""
+_STATUS_NS = NS_PER_MS
+"""Validity of a computed status, unless a message arrives."""
 _HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
 
 
@@ -58,24 +49,24 @@ class VehicleCondition:
         self._changed_ns: int | None = None
         """Last change that CURRENT_MODE or an EVENT reported."""
         self._stick_override_ns: int | None = None
-        self._altitude: tuple[int, float] | None = None
         self.rc: tuple[int, RcChannels] | None = None
         self._rc_sticks: Sticks | None = None
         self._pilot_sticks: Sticks | None = None
-        self._position: tuple[int, LocalVelocity] | None = None
-        self._system: tuple[int, SystemStatus] | None = None
-        self._landed: tuple[int, LandedState] | None = None
-        self._estimator: tuple[int, EstimatorFlags] | None = None
+        self._newest: dict[type, tuple[int, Body]] = {}
+        """Arrival and body of each other kind of message."""
+        self.is_receiver_hidden = False
+        """True if RC_CHANNELS may show our sticks in place of the receiver's."""
+        self.is_released = True
+        """True if other sticks than ours were seen since the release, or none of ours was sent."""
         self._is_rc_plausible: bool | None = None
         """True if RC_CHANNELS held a radio's sticks before our first override."""
         self._is_rc_healthy: bool | None = None
         """Receiver health by SYS_STATUS before our first override; None: not reported."""
         self._status: VehicleStatus | None = None
-        self._status_ns = (0, 0)
-        """First and last moment for which ``_status`` is valid, unless a message arrives."""
+        self._status_ns = 0
 
-    def receive(self, body: ConditionMessage, arrived_ns: int, *, may_be_ours: bool) -> None:
-        """Process a message; ``may_be_ours``: an override was sent, and hides the receiver."""
+    def receive(self, body: Body | None, arrived_ns: int) -> None:
+        """Process a message."""
         self._status = None
         match body:
             case Heartbeat():
@@ -84,19 +75,14 @@ class VehicleCondition:
                 self._receive_mode(body, arrived_ns)
             case Event(event_id):
                 self._receive_event(event_id, arrived_ns)
-            case Altitude(amsl_m=amsl_m):
-                self._altitude = (arrived_ns, amsl_m)
-            case LocalVelocity():
-                self._position = (arrived_ns, body)
-            case LandedState():
-                self._landed = (arrived_ns, body)
-            case EstimatorFlags():
-                self._estimator = (arrived_ns, body)
-            case SystemStatus():
-                self._system = (arrived_ns, body)
-                bit = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-                if not may_be_ours and body.present & bit:
-                    self._is_rc_healthy = bool(body.healthy & bit)
+            case None:
+                pass
+            case _:
+                self._newest[type(body)] = (arrived_ns, body)
+        if isinstance(body, SystemStatus) and not self.is_receiver_hidden:
+            bit = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+            if body.present & bit:
+                self._is_rc_healthy = bool(body.healthy & bit)
 
     def _receive_heartbeat(self, body: Heartbeat, arrived_ns: int) -> None:
         is_first, self.heartbeat = self.heartbeat is None, (arrived_ns, body)
@@ -140,15 +126,13 @@ class VehicleCondition:
         *,
         channels_us: tuple[int, ...],
         sticks: Sticks | None,
-        may_be_ours: bool,
-        is_released: bool,
     ) -> None:
         """Process RC_CHANNELS with its four stick channels and the sticks that they mean."""
         self._status = None
         self.rc, self._rc_sticks = (arrived_ns, rc), sticks
-        if not may_be_ours and channels_us:
+        if not self.is_receiver_hidden and channels_us:
             self._is_rc_plausible = all(value_us in RADIO_US for value_us in channels_us)
-        if is_released and self.has_receiver:
+        if self.is_released and self.has_receiver:
             self._pilot_sticks = sticks
 
     @property
@@ -160,25 +144,20 @@ class VehicleCondition:
         """
         return self._is_rc_plausible if self._is_rc_healthy is not False else False
 
-    @property
-    def _is_receiver_sick(self) -> bool:
-        if self._system is None:
-            return False
-        system, bit = self._system[1], dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-        return bool(system.present & bit) and not system.healthy & bit
+    def _system_bit(self, bit: int) -> bool | None:
+        """Return the newest health by SYS_STATUS; None: not reported."""
+        system = self._last(SystemStatus)
+        return bool(system.healthy & bit) if system is not None and system.present & bit else None
 
     @property
     def is_ready_to_arm(self) -> bool | None:
         """True if the autopilot's arming checks have passed; None: not reported."""
-        if self._system is None:
-            return None
-        system, bit = self._system[1], dialect.MAV_SYS_STATUS_PREARM_CHECK
-        return bool(system.healthy & bit) if system.present & bit else None
+        return self._system_bit(dialect.MAV_SYS_STATUS_PREARM_CHECK)
 
     @property
     def has_seen_radio(self) -> bool:
         """True if both messages that show a receiver have arrived."""
-        return self.rc is not None and self._system is not None
+        return self.rc is not None and self._last(SystemStatus) is not None
 
     def is_velocity_usable(self, now_ns: int) -> bool:
         """False for a velocity that the firmware sends without a valid estimate."""
@@ -188,32 +167,31 @@ class VehicleCondition:
 
     def amsl_m(self, now_ns: int) -> float | None:
         """Return the height above mean sea level; None without a fresh one."""
-        return _fresh(self._altitude, now_ns)
+        altitude = self._last(Altitude, now_ns)
+        return None if altitude is None else altitude.amsl_m
 
     def _flags(self, now_ns: int) -> int | None:
-        estimator = _fresh(self._estimator, now_ns)
+        estimator = self._last(EstimatorFlags, now_ns)
         return None if estimator is None else estimator.flags
 
-    def status(self, now_ns: int) -> VehicleStatus | None:
-        """Return the vehicle's status; None before its first heartbeat."""
+    def status(
+        self, now_ns: int, *, is_receiver_settled: bool, ignores_receiver: bool
+    ) -> VehicleStatus | None:
+        """Return the vehicle's status; None before its first heartbeat.
+
+        ``is_receiver_settled``: no receiver will appear that has not been seen yet.
+        """
         if self.heartbeat is None:
             return None
-        first_ns, last_ns = self._status_ns
-        if self._status is None or not first_ns <= now_ns <= last_ns:
-            self._status, self._status_ns = self._status_at(now_ns), (now_ns, self._next_ns(now_ns))
+        if self._status is None or not 0 <= now_ns - self._status_ns < _STATUS_NS:
+            has_receiver = self.has_receiver
+            is_absent = has_receiver is None and not self._profile.has_rc_channels_always
+            if is_receiver_settled and (is_absent or (has_receiver and ignores_receiver)):
+                has_receiver = False
+            self._status, self._status_ns = self._status_at(now_ns, has_receiver), now_ns
         return self._status
 
-    def _next_ns(self, now_ns: int) -> int:
-        """Return the moment at which the next piece of information becomes stale."""
-        limits = (
-            (self.rc, GAP_NS),
-            (self._position, POSITION_FRESH_NS),
-            *((told, SLOW_FRESH_NS) for told in (self._estimator, self._landed, self._system)),
-        )
-        ends = (told[0] + limit_ns for told, limit_ns in limits if told is not None)
-        return min((end for end in ends if end >= now_ns), default=sys.maxsize)
-
-    def _status_at(self, now_ns: int) -> VehicleStatus:
+    def _status_at(self, now_ns: int, has_receiver: bool | None) -> VehicleStatus:
         rc_ns, rc = self.rc or (None, RcChannels(()))
         is_shown = rc_ns is not None and now_ns - rc_ns <= GAP_NS
         is_valid = self._is_position_valid(now_ns)
@@ -227,8 +205,8 @@ class VehicleCondition:
             rc_arrived_ns=rc_ns,
             is_failsafe=self._is_failsafe,
             is_landed=self._is_landed(now_ns),
-            has_receiver=self.has_receiver,
-            is_receiver_sick=self._is_receiver_sick,
+            has_receiver=has_receiver,
+            is_receiver_sick=self._system_bit(dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER) is False,
             pilot_sticks=self._pilot_sticks,
             position_ned_m=self._position_ned_m(now_ns, is_valid),
             is_position_valid=is_valid,
@@ -250,17 +228,17 @@ class VehicleCondition:
         """Return the position if valid: some firmware also sends one without an estimate."""
         is_trusted = is_valid is None and not self._profile.sends_invalid_estimates
         is_good = is_valid is True or is_trusted
-        position = _fresh(self._position, now_ns, POSITION_FRESH_NS) if is_good else None
+        position = self._last(LocalVelocity, now_ns, POSITION_FRESH_NS) if is_good else None
         return None if position is None else position.position_ned_m
 
     def _is_landed(self, now_ns: int) -> bool | None:
-        landed = _fresh(self._landed, now_ns)
+        landed = self._last(LandedState, now_ns)
         if landed is None or landed.landed_state == dialect.MAV_LANDED_STATE_UNDEFINED:
             return None
         return bool(landed.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND)
 
     def _battery_problem(self, now_ns: int) -> Reason | None:
-        if (system := _fresh(self._system, now_ns)) is None:
+        if (system := self._last(SystemStatus, now_ns)) is None:
             return None
         bit = dialect.MAV_SYS_STATUS_SENSOR_BATTERY
         if system.present & bit and not system.healthy & bit:
@@ -270,7 +248,10 @@ class VehicleCondition:
             return because(Code.BATTERY_BELOW, percent=percent, limit=limit)
         return None
 
-
-def _fresh(told: tuple[int, _T] | None, now_ns: int, most_ns: int = SLOW_FRESH_NS) -> _T | None:
-    """Return what was told, with its arrival [ns], unless it is too old."""
-    return told[1] if told is not None and now_ns - told[0] <= most_ns else None
+    def _last(
+        self, kind: type[_T], now_ns: int | None = None, most_ns: int = SLOW_FRESH_NS
+    ) -> _T | None:
+        """Return the newest message of a kind, unless it is too old at ``now_ns``."""
+        arrived_ns, body = self._newest.get(kind, (0, None))
+        is_old = now_ns is not None and now_ns - arrived_ns > most_ns
+        return body if isinstance(body, kind) and not is_old else None

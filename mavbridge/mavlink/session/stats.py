@@ -7,11 +7,6 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
-_MOST_NAMES = 500
-"""Limit for message names: more than the dialect has. Messages that it lacks have numbers as names,
-16 million of them."""
-_REST = "others"
-
 
 class LinkCounters:
     """Counters of messages and losses of the chosen vehicle."""
@@ -26,8 +21,7 @@ class LinkCounters:
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256)."""
-        is_known = name in self._by_name or len(self._by_name) < _MOST_NAMES
-        self._by_name[name if is_known else _REST] += 1
+        self._by_name[name] += 1
         if self._last_sequence is not None:
             self._lost += (sequence - self._last_sequence - 1) % 256
         self._last_sequence = sequence
@@ -49,7 +43,7 @@ class LinkCounters:
         *,
         echo_confirmed: bool | None,
         unusable_packets: int,
-        refused_signatures: int = 0,
+        refused_signatures: int,
         saturated: Mapping[str, int],
     ) -> LinkStats:
         """Return the totals; ``saturated``: messages in which each stick demanded too much."""

@@ -1,5 +1,6 @@
 """Telemetry requests at the rate of the action loop, repeated whenever a stream slows down."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -23,71 +24,61 @@ _STAND_IN_NS = 50 * NS_PER_MS
 """Time between two requests for a stand-in, once its stream has been away for ``_AWAY_NS``."""
 _SCALED_WINDOWS = 2
 """Consecutive windows at one rate fraction that mean a full link; a single one may be a hiccup."""
-_LOSSY = 0.1
-"""Fraction of lost packets above which loss explains low rates."""
 
 
 class _Stream:
     """Negotiation of message, rate and kind of request for one group."""
 
     def __init__(self, group: StreamGroup) -> None:
-        self.group = group
-        self.rate_hz = group.rate_hz
-        self.attempts = 0
-        self.is_settled = False
-        self.is_given_up = False
-        """True for an optional group that the vehicle does not grant."""
-        self.received: dict[str, int] = {}
-        """Messages by name: a vehicle may also send another one of the group unrequested."""
         self.has_settled = False
         """True if it has been granted or given up once."""
-        self.newest_ns = 0
-        self.stand_in_due_ns = 0
+        self.received: Counter[str] = Counter()
+        """Messages by name: a vehicle may also send another one of the group unrequested."""
+        self.newest_ns = self.stand_in_due_ns = 0
         self.is_absence_told = False
-        self.is_denied = False
-        """True if each message was denied at each rate: request again after a pause."""
-        self._choice = 0
-
-    def request(self) -> Request:
-        """Return the next request: REQUEST_DATA_STREAM if no message interval was granted."""
-        self.attempts += 1
-        self.is_denied = False
-        if self._choice >= len(self.group.messages) and self.group.stream is not None:
-            return StreamRequest(self.group.stream, max(round(self.rate_hz), 1))
-        number = IDS[self.group.messages[self._choice % len(self.group.messages)]]
-        return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
+        self.want(group)
 
     def want(self, group: StreamGroup) -> None:
-        """Restart the negotiation for this group of the same messages."""
-        self.group, self.rate_hz, self.attempts = group, group.rate_hz, 0
-        self.is_settled = self.is_given_up = False
+        """Begin, or begin again for this group of the same messages."""
+        self.group = group
+        self._options = _options(group)
+        self._at = self.attempts = 0
+        self.is_settled = self.is_given_up = self.is_denied = False
+        """Given up: an optional group that the vehicle does not grant. Denied: so was each option;
+        request again after a pause."""
 
-    def accept(self) -> None:
+    @property
+    def rate_hz(self) -> float:
+        """Rate of the present option."""
+        return self._options[self._at][1]
+
+    def request(self) -> Request:
+        """Return the next request."""
+        self.attempts += 1
+        self.is_denied = False
+        return self._options[self._at][0]
+
+    def settle(self, *, is_given_up: bool = False) -> None:
+        """Note that the group is granted, or given up."""
         self.is_settled, self.has_settled, self.attempts = True, True, 0
+        self.is_given_up = is_given_up
 
     def refuse(self) -> None:
-        """Try half the rate, then the next message: "denied" may mean too fast or unknown."""
+        """Go on to the next option."""
         self.attempts = 0
-        if self.group.is_optional:
-            self._give_up()
+        if not self.group.is_needed:
+            self.settle(is_given_up=True)
             return
-        if self.rate_hz / 2 >= _LOWEST_HZ:
-            self.rate_hz /= 2
-            return
-        self.rate_hz = self.group.rate_hz
-        self._choice += 1
-        has_more = self._choice % len(self.group.messages) or self.group.stream is not None
-        self.is_denied = not has_more
+        self._at = (self._at + 1) % len(self._options)
+        self.is_denied = self._at == 0
 
     def give_up_intervals(self) -> None:
-        """Go on to REQUEST_DATA_STREAM: no SET_MESSAGE_INTERVAL is answered."""
+        """Go on to REQUEST_DATA_STREAM, if there is one: no SET_MESSAGE_INTERVAL is answered."""
         self.attempts = 0
-        self._choice = len(self.group.messages)
-        if self.group.is_optional:
-            self._give_up()
-
-    def _give_up(self) -> None:
-        self.is_settled = self.has_settled = self.is_given_up = True
+        if not self.group.is_needed:
+            self.settle(is_given_up=True)
+        elif self.group.stream is not None:
+            self._at = len(self._options) - 1
 
     def share(self, span_s: float) -> float:
         """Return the arrival rate as a fraction of the granted rate."""
@@ -101,6 +92,26 @@ class _Stream:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
         return not self.is_given_up and self._count < least_hz * span_s
+
+
+def _options(group: StreamGroup) -> list[tuple[Request, float]]:
+    """Return the requests for a group and their rates; "denied" may mean too fast or unknown.
+
+    REQUEST_DATA_STREAM comes last.
+    """
+    rates_hz = [group.rate_hz]
+    while rates_hz[-1] / 2 >= _LOWEST_HZ:
+        rates_hz.append(rates_hz[-1] / 2)
+    interval = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+    options: list[tuple[Request, float]] = [
+        (CommandRequest(interval, (IDS[name], 1e6 / rate_hz)), rate_hz)
+        for name in group.messages
+        for rate_hz in rates_hz
+    ]
+    if group.stream is not None:
+        legacy = StreamRequest(group.stream, max(round(group.rate_hz), 1))
+        options.append((legacy, group.rate_hz))
+    return options
 
 
 class StreamRequester:
@@ -127,9 +138,6 @@ class StreamRequester:
         self._requested_ns = 0
         self._window_ns: int | None = None
         """Start of the counting window; None while requests are open."""
-        self._sequence: int | None = None
-        self._received = self._lost = 0
-        """Packets of any kind in this window."""
         self._scaled_windows = 0
         self._has_told = False
         self.renewals = 0
@@ -149,16 +157,12 @@ class StreamRequester:
     @property
     def is_settled(self) -> bool:
         """True if every required group is granted."""
-        return all(stream.is_settled or stream.group.is_optional for stream in self._streams)
+        return all(stream.is_settled or not stream.group.is_needed for stream in self._streams)
 
-    def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
+    def receive(self, name: str, arrived_ns: int) -> None:
         """Count one message."""
-        if self._sequence is not None:
-            self._lost += (sequence - self._sequence - 1) % 256
-        self._sequence = sequence
-        self._received += 1
         if (stream := self._by_message.get(name)) is not None:
-            stream.received[name] = stream.received.get(name, 0) + 1
+            stream.received[name] += 1
             stream.newest_ns = arrived_ns
 
     def receive_ack(self, ack: CommandAck) -> None:
@@ -168,7 +172,7 @@ class StreamRequester:
         if ack.result in _UNDECIDED:
             return  # repeated as if there were no answer
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
-            self._pending.accept()
+            self._pending.settle()
         else:
             self._pending.refuse()
         self._pending = None
@@ -189,7 +193,7 @@ class StreamRequester:
         self._requested_ns = now_ns
         request = self._pending.request()
         if isinstance(request, StreamRequest):  # never acknowledged
-            self._pending.accept()
+            self._pending.settle()
             self._pending = None
         return request
 
@@ -212,7 +216,6 @@ class StreamRequester:
                 return
             self._judge((now_ns - self._window_ns) / NS_PER_S)
         self._window_ns = now_ns
-        self._received = self._lost = 0
         for stream in self._streams:
             stream.received.clear()
 
@@ -228,7 +231,7 @@ class StreamRequester:
                 self._tell_absence(stream)
             if stream.is_slow(span_s):
                 stream.is_settled = False
-                self.renewals += not stream.group.is_optional
+                self.renewals += stream.group.is_needed
 
     def _tell_absence(self, stream: _Stream) -> None:
         if not stream.is_absence_told:
@@ -237,9 +240,9 @@ class StreamRequester:
 
     def _common_share(self, span_s: float) -> float | None:
         """Return the common rate fraction of all required streams, if a full link explains it."""
-        needed = [stream.share(span_s) for stream in self._streams if not stream.group.is_optional]
+        needed = [stream.share(span_s) for stream in self._streams if stream.group.is_needed]
         shares = [share for share in needed if share > 0]  # no estimate, no messages
-        if len(shares) < 2 or self._lost > _LOSSY * (self._lost + self._received):
+        if len(shares) < 2:
             return None
         mean = sum(shares) / len(shares)
         is_alike = max(shares) - min(shares) <= _ALIKE * mean

@@ -3,13 +3,11 @@
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Reading, Sample, Telemetry
 from mavbridge.mavlink.codec.messages import (
-    RESTART_STAMPS,
-    RESTART_STEP_US,
     Altitude,
     Attitude,
     LocalVelocity,
     Measurement,
-    later_by_us,
+    StampOrder,
 )
 from mavbridge.mavlink.codec.packets import Codec
 
@@ -31,28 +29,20 @@ class _Filter:
         self._rank = 0
         self._arrived_ns: int | None = None
         self._happened_ns = 0
-        self._boot_us = 0
-        self._old_stamps = 0
+        self._order = StampOrder()
 
     def delay_ns(self, rank: int, boot_us: int, arrived_ns: int, happened_ns: int) -> int | None:
         """Return the delay of a message that is used, or None; a lower rank is better.
 
         A negative delay means a timestamp in the future.
         """
-        if self._arrived_ns is not None:
-            if rank > self._rank and arrived_ns - self._arrived_ns <= _YIELD_NS:
-                return None
-            later_us = later_by_us(boot_us, self._boot_us)
-            if boot_us > 0 >= later_us:
-                self._old_stamps = self._old_stamps + 1 if later_us < -RESTART_STEP_US else 0
-                if self._old_stamps < RESTART_STAMPS:
-                    return None
-            if happened_ns < self._happened_ns:
-                # The offset of the clocks has improved; a newer message still happened later.
-                happened_ns = self._happened_ns
-        self._rank, self._boot_us, self._old_stamps = rank, boot_us, 0
-        self._arrived_ns = arrived_ns
-        self._happened_ns = happened_ns if happened_ns < arrived_ns else arrived_ns
+        is_live = self._arrived_ns is not None and arrived_ns - self._arrived_ns <= _YIELD_NS
+        if (is_live and rank > self._rank) or not self._order.accepts(boot_us):
+            return None
+        # The offset of the clocks may have improved; a newer message still happened later.
+        happened_ns = max(happened_ns, self._happened_ns)
+        self._rank, self._arrived_ns = rank, arrived_ns
+        self._happened_ns = min(happened_ns, arrived_ns)
         return arrived_ns - happened_ns
 
 

@@ -5,7 +5,6 @@ reboot of the vehicle are handled alike, and none of them blocks the action loop
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -35,7 +34,7 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile
 from mavbridge.mavlink.profiles.px4 import PX4
-from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
+from mavbridge.mavlink.session.condition import VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester
@@ -80,13 +79,11 @@ _GAP = "..."
 
 
 class TextJoiner:
-    """Joins the pieces of one text, in any order; a missing piece becomes dots."""
+    """Joins the pieces of one text as they arrive; a missing piece becomes dots."""
 
     def __init__(self) -> None:
         self._text_id = 0
-        self._pieces: dict[int, str] = {}
-        self._last: int | None = None
-        """Index of the last piece, once it has arrived."""
+        self._pieces: list[str] = []
         self._since_ns = 0
 
     def receive(self, body: StatusText, now_ns: int) -> list[str]:
@@ -96,26 +93,18 @@ class TextJoiner:
         texts = [] if body.text_id == self._text_id else self._end()
         if not self._pieces:
             self._text_id, self._since_ns = body.text_id, now_ns
-        self._pieces[body.sequence] = body.text
-        if not body.is_full:
-            self._last = body.sequence
-        if self._last is not None and len(self._pieces) > self._last:
-            texts += self._end()
-        return texts
+        missing = body.sequence - len(self._pieces)
+        self._pieces += [*[_GAP] * missing, body.text]
+        return texts if body.is_full else texts + self._end(is_whole=True)
 
     def step(self, now_ns: int) -> list[str]:
         """Return the text whose missing pieces are overdue, if any."""
         return self._end() if now_ns - self._since_ns > _WAIT_NS else []
 
-    def _end(self) -> list[str]:
-        if not self._pieces:
-            return []
-        end = max(self._pieces) + 1
-        text = "".join(self._pieces.get(place, _GAP) for place in range(end))
-        if self._last is None:
-            text += _GAP
-        self._text_id, self._pieces, self._last = 0, {}, None
-        return [text.rstrip()]
+    def _end(self, *, is_whole: bool = False) -> list[str]:
+        text = "".join(self._pieces)
+        self._pieces = []
+        return [(text if is_whole else text + _GAP).rstrip()] if text else []
 
 
 RECEIVER_WAIT_NS = 2 * NS_PER_S
@@ -135,7 +124,6 @@ class VehicleSession:
     """One vehicle from its first heartbeat to its next reboot.
 
     Reads its version and its parameters, then requests its streams and keeps them coming.
-    ``report`` shows a text to the user.
 
     Raises:
         PeerError: the vehicle cannot be flown.
@@ -153,15 +141,12 @@ class VehicleSession:
         """``old_params``: receives the values from before ``--set``, by name."""
         self.profile = require_profile(identity.autopilot, identity.vehicle_type)
         self.identity = identity
-        self._report = report
+        self.report = report
+        """Shows a text to the user."""
         self.condition = VehicleCondition(
             self.profile, min_battery_percent=config.min_battery_percent
         )
         self._texts = TextJoiner()
-        self.is_receiver_hidden = False
-        """True if RC_CHANNELS may show our sticks in place of the receiver's."""
-        self.is_released = True
-        """True if other sticks than ours were seen since the release, or none of ours was sent."""
         self.version: str | None = None
         self._version_attempts = 0
         self._version_due_ns = 0
@@ -180,8 +165,6 @@ class VehicleSession:
         """Silence before the first old timestamp."""
         self._old_stamps = 0
         self._upset: tuple[int, Reason] | None = None
-        self._without_receiver: tuple[VehicleStatus, VehicleStatus] | None = None
-        """Cache of a status and its copy without a receiver."""
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: request its echo, check its demands."""
@@ -199,10 +182,9 @@ class VehicleSession:
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
         """Process one message from this vehicle."""
-        self._streams.receive(message.name, message.sequence, arrived_ns)
+        self._streams.receive(message.name, arrived_ns)
         body = message.body
-        if isinstance(body, ConditionMessage):
-            self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
+        self.condition.receive(body, arrived_ns)
         match body:
             case Attitude():
                 self._watch_boot(body.boot_us // 1000, arrived_ns)
@@ -223,7 +205,7 @@ class VehicleSession:
 
     def _show(self, *texts: str) -> None:
         for text in texts:
-            self._report(said_by_vehicle(text))
+            self.report(said_by_vehicle(text))
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
         calibration = self.calibration
@@ -236,8 +218,6 @@ class VehicleSession:
             sticks=calibration.to_sticks(pwm_us)
             if calibration and pwm_us and all(pwm_us)
             else None,
-            may_be_ours=self.is_receiver_hidden,
-            is_released=self.is_released,
         )
         if (switch := self.params.override_switch) is not None:
             in_range = switch <= len(rc.channels_us)
@@ -306,15 +286,11 @@ class VehicleSession:
 
     def status(self, now_ns: int) -> VehicleStatus | None:
         """Return the vehicle's status; None before its first heartbeat."""
-        status = self.condition.status(now_ns)
-        if status is None or not self._is_receiver_settled(now_ns):
-            return status
-        is_absent = status.has_receiver is None and not self.profile.has_rc_channels_always
-        if not (is_absent or (status.has_receiver and self.params.ignores_receiver)):
-            return status
-        if self._without_receiver is None or self._without_receiver[0] is not status:
-            self._without_receiver = (status, replace(status, has_receiver=False))
-        return self._without_receiver[1]
+        return self.condition.status(
+            now_ns,
+            is_receiver_settled=self._is_receiver_settled(now_ns),
+            ignores_receiver=self.params.ignores_receiver,
+        )
 
     def problem(self, now_ns: int) -> Reason | None:
         """Return why the vehicle cannot be flown now with any output, or None."""

@@ -6,9 +6,10 @@ from typing import Protocol, TypeAlias
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import Outlet, Packet
+from mavbridge.core.vehicle import AdviceText, Outlet, Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.codec.readers import UNKNOWN
 from mavbridge.mavlink.codec.signing import Refusal
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
@@ -16,8 +17,8 @@ REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
 """Time limit of one read pass, so that a flood does not delay the guard's next slot. The rest stays
 with the kernel, which drops packets that it cannot hold."""
-_UNCHECKED = "UNKNOWN"
-"""Prefix of pymavlink's names for messages that the dialect lacks."""
+_MOST_ADVICE = 100
+"""Largest number of advice texts: they quote values, which may change without end."""
 REFUSED_NS = 100 * NS_PER_MS
 """Time of refused sends after which they count as a problem."""
 
@@ -64,13 +65,15 @@ class Connection:
         """First refused send since the last successful one."""
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
-        self.texts: list[str] = []
-        """Messages for the user, until `take_texts`."""
+        self._texts: list[str] = []
+        self._advice: set[str] = set()
+        """Advice already given."""
         self.received_bytes = 0
         self.received_packets = 0
         """Number of packets with a valid checksum; noise looks like packets of unknown messages,
         which have none to test."""
-        self._told: list[str] = []
+        self._told_signatures = 0
+        """Number of kinds of rejected signatures that were reported."""
         self._opened = 0
         self._open(clock.now_ns())
 
@@ -92,10 +95,17 @@ class Connection:
         self._refused_ns = None
         self._codec.forget_partial()
 
+    def report(self, text: str) -> None:
+        """Keep a text for the user until `take_texts`; advice only the first time."""
+        if isinstance(text, AdviceText):
+            if text in self._advice or len(self._advice) >= _MOST_ADVICE:
+                return
+            self._advice.add(text)
+        self._texts.append(text)
+
     def take_texts(self) -> tuple[str, ...]:
         """Return the messages for the user since the last call."""
-        texts = tuple(self.texts)
-        self.texts.clear()
+        texts, self._texts = tuple(self._texts), []
         return texts
 
     def fileno(self) -> int | None:
@@ -111,7 +121,7 @@ class Connection:
     def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + REOPEN_NS
-        self.texts.append(f"connection lost ({error}); reconnecting")
+        self.report(f"connection lost ({error}); reconnecting")
 
     def receive(self) -> Iterator[Arrival]:
         """Yield the messages that have arrived; reopen the transport when that is due."""
@@ -126,7 +136,7 @@ class Connection:
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
-                    self.received_packets += not message.name.startswith(_UNCHECKED)
+                    self.received_packets += message.name != UNKNOWN
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
                     yield message, arrived_ns, sender
@@ -143,9 +153,9 @@ class Connection:
             reasons = [str(self.hint)] if self.hint else []
         else:
             reasons = [REFUSALS[refusal] for refusal in signing.refused]
-        for text in reasons[len(self._told) :]:
-            self._told.append(text)
-            self.texts.append(text)
+        for text in reasons[self._told_signatures :]:
+            self._told_signatures += 1
+            self.report(text)
 
     @property
     def hint(self) -> Reason | None:

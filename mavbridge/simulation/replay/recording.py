@@ -10,7 +10,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
-from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
+from mavbridge.mavlink.codec.tlog import read_tlog
 from mavbridge.recording import replay_tables, rows
 from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
 from mavbridge.recording.meta import FlightMeta, read_meta
@@ -96,8 +96,12 @@ def open_source(folder: Path) -> ReplaySource:
         )
     stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
     offset_ns, system = settings.wall_offset_ns, config.link.source_system
-    skipped = Skipped()
-    log = list(read_tlog(folder / TLOG, skipped))
+    log, skipped = read_tlog(folder / TLOG)
+    if skipped:
+        damage.append(
+            f"{folder / TLOG} is damaged, or of another MAVLink dialect: {skipped} bytes were "
+            "skipped"
+        )
     received = [each for each in log if each[1].source.system != system]
     asked = [packet for _, packet in log if packet.source.system == system]
     packets = tuple(_packets(received, stamps, offset_ns))
@@ -118,7 +122,6 @@ def open_source(folder: Path) -> ReplaySource:
         ),
         gaps=(
             *damage,
-            *filter(None, [skipped.describe(folder / TLOG)]),
             *_lost(
                 ticks=sum(row.dropped_before for row in ticks),
                 solves=sum(row.dropped_before for row in solve_rows),

@@ -2,7 +2,6 @@
 
 import math
 import struct
-import time
 from math import hypot, inf, nan, pi, sqrt
 from typing import Any
 
@@ -126,11 +125,11 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
     (m.manual_control_encode(1, 122, -5, 500, 1000, 0), ManualControl(122, -5, 500, 1000)),
     (
         m.attitude_target_encode(7, 7, [0.5, 0.5, -0.5, 0.5], 1, 2, 3, 0.4),
-        AttitudeTarget(7000, 7, (0.5, 0.5, -0.5, 0.5), (1, 2, 3), 0.4),
+        AttitudeTarget((1, 2, 3), 0.4),
     ),
     (
         m.position_target_local_ned_encode(7, 1, 3079, nan, nan, nan, 1, 2, -3, 0, 0, 0, 0, 0.5),
-        VelocityTarget(7000, 3079, (1, 2, -3), 0.5),
+        VelocityTarget(3079, (1, 2, -3)),
     ),
     (
         m.global_position_int_encode(7, 0, 0, 489423, -12345, 0, 0, 0, 0),
@@ -290,19 +289,7 @@ def test_a_message_without_a_name_keeps_its_sender_and_its_place_in_the_sequence
         (message,) = ours.decode_datagram(packet)
         assert (message.source, message.sequence) == (source, sequence)
         assert (message.body, message.packet) == (None, packet)
-        assert message.name.startswith("UNKNOWN_")
-
-
-@pytest.mark.parametrize("unit", [b"\xfe\0", b"\xfd\0\0\0\0\0"], ids=["v1", "v2"])
-def test_a_huge_datagram_costs_no_more_than_a_large_one(unit: bytes) -> None:
-    """All of it would have kept the guard from its sticks for 35 ms."""
-    ours = codec()
-    huge = (unit * 65_507)[:65_507]
-    start_s = time.thread_time()
-    assert list(ours.decode_datagram(huge)) == []
-    assert time.thread_time() - start_s < 0.05
-    assert ours.bad_data_count <= 1 + MOST_DATAGRAM_BYTES // 8
-    assert [m.name for m in ours.decode_datagram(WireEnd().heartbeat())] == ["HEARTBEAT"]
+        assert message.name == "UNKNOWN"
 
 
 # --- sent
@@ -344,12 +331,7 @@ def test_overrides_and_releases_hold_the_stick_channels_alone(
     pwm_us: Pwm | None, channels_us: list[int]
 ) -> None:
     ours = codec()
-    packet = (
-        ours.encode_release(TARGET, ARDUPILOT)
-        if pwm_us is None
-        else ours.encode_override(TARGET, pwm_us, ARDUPILOT)
-    )
-    message = sent(packet)
+    message = sent(ours.encode_override(TARGET, pwm_us, ARDUPILOT))
     channels = [getattr(message, f"chan{k}_raw") for k in range(1, 19)]
     assert channels == [*channels_us, *[65535] * 4, *[0] * 10]
     assert (message.target_system, message.target_component) == TARGET
@@ -382,15 +364,15 @@ def test_no_throttle_and_yaw_of_a_policy_are_a_gesture(throttle: float, yaw: flo
 
 def test_an_attitude_has_a_thrust_and_no_rates() -> None:
     quaternion = quaternion_from_euler(0.2, -0.1, 3.0)
-    message = sent(codec().encode_attitude(TARGET, quaternion, 0.25, now_ns=100 * 10**9))
+    message = sent(codec().encode_attitude(TARGET, quaternion, NO_RATES, 0.25, now_ns=100 * 10**9))
     assert (message.get_type(), message.type_mask) == ("SET_ATTITUDE_TARGET", 7)
     assert (message.target_system, message.target_component) == TARGET
     assert (message.thrust, message.time_boot_ms) == (0.25, 100_000)
     assert tuple(message.q) == pytest.approx(quaternion, abs=1e-7)
     rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
     assert rates == (0.0, 0.0, 0.0)
-    codec().encode_attitude(TARGET, (1 + 0.9e-4, 0.0, 0.0, 0.0), 1.0, now_ns=0)
-    codec().encode_attitude(TARGET, leaning(84.9), 0.5, now_ns=0)
+    codec().encode_attitude(TARGET, (1 + 0.9e-4, 0.0, 0.0, 0.0), NO_RATES, 1.0, now_ns=0)
+    codec().encode_attitude(TARGET, leaning(84.9), NO_RATES, 0.5, now_ns=0)
 
 
 def leaning(degrees: float) -> Quaternion:
@@ -404,7 +386,7 @@ def leaning(degrees: float) -> Quaternion:
 def test_body_rates_stand_beside_a_level_attitude_that_is_ignored(
     rates: tuple[float, float, float],
 ) -> None:
-    message = sent(codec().encode_rates(TARGET, rates, 0.5, now_ns=2**32 * 1_000_000))
+    message = sent(codec().encode_attitude(TARGET, None, rates, 0.5, now_ns=2**32 * 1_000_000))
     assert (message.type_mask, message.thrust, message.time_boot_ms) == (128, 0.5, 0)
     assert (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate) == rates
     assert tuple(message.q) == LEVEL
@@ -450,19 +432,18 @@ ODD_PWM = (
     ("encode", "message"),
     [
         *(
-            (lambda c, q=q: c.encode_attitude(TARGET, q, 0.5, now_ns=0), "quaternion|leans too far")
+            (
+                lambda c, q=q: c.encode_attitude(TARGET, q, NO_RATES, 0.5, now_ns=0),
+                "quaternion|leans too far",
+            )
             for q in ODD_QUATERNIONS
         ),
         *((lambda c, v=v: c.encode_manual_control(1, ManualControl(*v)), "MANUAL_CONTROL")
           for v in ODD_STICKS),
         *((lambda c, v=v: c.encode_override(TARGET, v, ARDUPILOT), "us ") for v in ODD_PWM),
         *(
-            case
+            (lambda c, v=thrust: c.encode_attitude(TARGET, LEVEL, NO_RATES, v, now_ns=0), "thrust")
             for thrust in (nan, -0.01, 1.01, inf)
-            for case in (
-                (lambda c, v=thrust: c.encode_attitude(TARGET, LEVEL, v, now_ns=0), "thrust"),
-                (lambda c, v=thrust: c.encode_rates(TARGET, NO_RATES, v, now_ns=0), "thrust"),
-            )
         ),
     ],
 )  # fmt: skip
@@ -477,7 +458,7 @@ def test_no_rate_or_velocity_that_no_multirotor_has_leaves(bad: float, axis: int
     values = [0.0] * 3
     values[axis] = bad
     with pytest.raises(CommandRefusedError, match="body rates"):
-        codec().encode_rates(TARGET, (values[0], values[1], values[2]), 0.5, now_ns=0)
+        codec().encode_attitude(TARGET, None, (values[0], values[1], values[2]), 0.5, now_ns=0)
     for velocity in (Velocity(*[4 * v for v in values], 0.0), Velocity(0.0, 0.0, 0.0, bad)):
         with pytest.raises(CommandRefusedError, match="velocity"):
             codec().encode_velocity(TARGET, velocity, is_heading_frame=False, now_ns=0)

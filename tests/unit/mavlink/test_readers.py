@@ -11,26 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.flown_vehicle import codec
 from mavbridge.mavlink.codec.frames import checksum, frame_at
 from mavbridge.mavlink.codec.messages import Body, CurrentMode, Endpoint, Event, ReceivedMessage
-from mavbridge.mavlink.codec.packets import pack_override
 from mavbridge.mavlink.codec.readers import IDS, LAYOUTS, READERS, UnusableError
 
 byte = st.integers(0, 255)
 number = st.floats(width=32) | st.just(0.0)
-
-
-@given(
-    st.lists(st.integers(0, 65535), min_size=8, max_size=8),
-    byte,
-    st.tuples(byte, byte),
-    st.tuples(byte, byte),
-)
-def test_an_override_is_packed_as_pymavlink_packs_it(
-    channels_us: list[int], sequence: int, source: tuple[int, int], target: tuple[int, int]
-) -> None:
-    mav = dialect.MAVLink(None, srcSystem=source[0], srcComponent=source[1])
-    mav.seq = sequence
-    expected = mav.rc_channels_override_encode(*target, *channels_us).pack(mav)
-    assert pack_override(Endpoint(*source), sequence, Endpoint(*target), channels_us) == expected
 
 
 @st.composite

@@ -65,7 +65,7 @@ def test_what_we_sign_is_what_pymavlink_accepts():
     packets = [
         codec.encode_heartbeat(),
         codec.encode_override(TARGET, (1500, 1500, 1500, 1500), ARDUPILOT),
-        codec.encode_release(TARGET, ARDUPILOT),
+        codec.encode_override(TARGET, None, ARDUPILOT),
         codec.encode_request(TARGET, ParamWrite("RC_OVERRIDE_TIME", 0.5, 9)),
         codec.encode_timesync(5),
     ]

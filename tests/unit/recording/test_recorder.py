@@ -9,7 +9,7 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
 from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe

@@ -12,7 +12,7 @@ import pytest
 
 from helpers.recordings import make_row, picture, send_signal
 from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
 from mavbridge.recording.video.file import count_frames
 from mavbridge.recording.video.writer import VideoWriter, WriterError

@@ -31,15 +31,20 @@ _STANDARD_BAUDS = (57600, 115200, 230400, 460800, 921600, 1500000, 3000000)
 class Assessment(NamedTuple):
     """Result of checking one set of parameters."""
 
+    context: ParamContext
     calibration: RcCalibration | None
     unusable: str | None
     """Why a calibration that the output needs is missing; None: it is not."""
     override_switch: int | None
     """Number of the channel that enables the output."""
-    obstacles: tuple[ParamNote, ...]
-    """Reasons why the vehicle would not follow our commands."""
+    notes: tuple[ParamNote, ...]
     dangers: tuple[Danger, ...]
     """All dangers, including accepted ones."""
+
+    @property
+    def obstacles(self) -> tuple[ParamNote, ...]:
+        """Reasons why the vehicle would not follow our commands."""
+        return tuple(note for note in self.notes if note.kind == "obstacle")
 
     def endangers(self, before: "Assessment", *, accepted: Container[Risk]) -> bool:
         """True if these parameters must end a flight that began with ``before``."""
@@ -63,10 +68,11 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
     except ValueError as error:
         unusable = str(error) if is_override else None
     return Assessment(
+        context,
         ours,
         unusable,
         profile.override_switch(values) if is_override else None,
-        tuple(profile.obstacles(values, context)),
+        tuple(profile.notes(values, context)),
         tuple(profile.dangers(values, context)),
     )
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from enum import Enum, auto
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
@@ -33,15 +32,6 @@ class _Write:
         return self.answer is not None and is_same(self.answer, self.value)
 
 
-class _Phase(Enum):
-    WAITING = auto()
-    """Values are still arriving, or the vehicle is armed, or its state is unknown."""
-    WRITING = auto()
-    READY = auto()
-    RESTORING = auto()
-    ENDED = auto()
-
-
 class TemporaryParams:
     """Sets the wanted parameters of a disarmed vehicle, and restores the old values.
 
@@ -59,28 +49,27 @@ class TemporaryParams:
         self._wanted = dict(wanted)
         self._before = before
         self._report = report
-        self._phase = _Phase.WAITING if wanted else _Phase.READY
         self._failures: dict[str, Reason] = {}
-        self._is_disarmed = False
-        self._is_ending = False
-        self._open: dict[str, _Write] = {}
+        self._is_disarmed = self._is_ending = self._is_restoring = False
+        self._open: dict[str, _Write] | None = None if wanted else {}
+        """Outstanding writes; None before the first."""
 
     def problem(self) -> Reason | None:
         """Return why a flight may not begin yet, or None."""
         if self._failures:
             return next(iter(self._failures.values()))
-        if self._phase not in (_Phase.WAITING, _Phase.WRITING):
+        if self.is_settled or self._is_restoring:
             return None
         return because(Code.SETTING_PARAMETERS if self._is_disarmed else Code.SET_NEEDS_DISARMING)
 
     @property
     def is_settled(self) -> bool:
         """True if no write is outstanding."""
-        return self._phase in (_Phase.READY, _Phase.ENDED)
+        return self._open == {}
 
     def receive(self, param: ParamValue) -> None:
         """Process a PARAM_VALUE: a confirmation, or a value that the pilot has corrected."""
-        write = self._open.get(param.name)
+        write = (self._open or {}).get(param.name)
         if write is not None and write.attempts and not write.is_confirmed:
             write.answer = param.value
         if param.name in self._failures and is_same(param.value, self._wanted[param.name]):
@@ -94,52 +83,50 @@ class TemporaryParams:
         ``values``: all values received from the vehicle; ``is_complete``: no more will arrive.
         """
         self._is_disarmed = is_disarmed
-        if self._is_ending and self._phase not in (_Phase.RESTORING, _Phase.ENDED):
-            self._begin_restoring(values)
-        if self._phase is _Phase.WAITING and is_complete and is_disarmed:
-            self._begin_writing(values)
-        if self._phase not in (_Phase.WRITING, _Phase.RESTORING):
+        if self._is_ending and not self._is_restoring:
+            self._open = self._begin_restoring(values)
+        elif self._open is None and is_complete and is_disarmed:
+            self._open = self._begin_writing(values)
+        if not self._open:
             return
         for name in [name for name, write in self._open.items() if write.is_confirmed]:
-            self._conclude(name)
+            self._conclude(name, self._open.pop(name))
         if is_disarmed:
-            yield from self._write(now_ns)
-        elif self._phase is _Phase.RESTORING and self._open:
+            yield from self._write(self._open, now_ns)
+        elif self._is_restoring and self._open:
             self._open.clear()
             self._report_what_stays()
-        if not self._open:
-            self._phase = _Phase.READY if self._phase is _Phase.WRITING else _Phase.ENDED
 
-    def _write(self, now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
+    def _write(self, writes: dict[str, _Write], now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
         """Yield the write requests that are due.
 
         A repetition also reads the value: a vehicle that has it already may not answer a write.
         """
-        for name, write in list(self._open.items()):
+        for name, write in list(writes.items()):
             if write.attempts and now_ns - write.requested_ns < _TIMEOUT_NS:
                 continue
             if write.attempts >= _ATTEMPTS:
-                self._conclude(name)
+                self._conclude(name, writes.pop(name))
                 continue
             write.requested_ns, write.attempts = now_ns, write.attempts + 1
             yield ParamWrite(name, write.value)
             if write.attempts > 1:
                 yield ParamRequest(name)
 
-    def _begin_writing(self, values: Mapping[str, float]) -> None:
-        self._phase = _Phase.WRITING
+    def _begin_writing(self, values: Mapping[str, float]) -> dict[str, _Write]:
+        writes = {}
         for name, value in self._wanted.items():
             if (now := values.get(name)) is None:
                 self._failures[name] = because(Code.SET_ABSENT, name=name, value=value)
             elif not is_same(now, value):
                 self._before[name] = now
-                self._open[name] = _Write(value)
+                writes[name] = _Write(value)
+        return writes
 
-    def _conclude(self, name: str) -> None:
+    def _conclude(self, name: str, write: _Write) -> None:
         """Report the outcome of this parameter's write."""
-        write = self._open.pop(name)
         asked, answer = write.value, write.answer
-        if self._phase is _Phase.RESTORING:
+        if self._is_restoring:
             if write.is_confirmed:
                 self._report(f"{name} put back to {asked:g}")
                 self._before.pop(name, None)
@@ -163,11 +150,10 @@ class TemporaryParams:
         Return True if everything is restored, or nothing more can be done now.
         """
         self._is_ending = True
-        return self._phase is _Phase.ENDED or not self._wanted
+        return not self._wanted or (self._is_restoring and self.is_settled)
 
-    def _begin_restoring(self, values: Mapping[str, float]) -> None:
-        self._open.clear()
-        self._phase = _Phase.RESTORING
+    def _begin_restoring(self, values: Mapping[str, float]) -> dict[str, _Write]:
+        self._is_restoring, writes = True, {}
         for name, before in list(self._before.items()):
             now = values.get(name)
             if now is not None and not any(is_same(now, v) for v in (before, self._wanted[name])):
@@ -175,9 +161,10 @@ class TemporaryParams:
                 del self._before[name]
             elif self._is_disarmed:
                 # Also if it shows the old value: a write may be under way.
-                self._open[name] = _Write(before)
+                writes[name] = _Write(before)
         if not self._is_disarmed:
             self._report_what_stays()
+        return writes
 
     def _report_what_stays(self) -> None:
         if self._before:

@@ -10,7 +10,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
+from mavbridge.mavlink.profiles.profile import ParamContext, Profile, StreamGroup
 from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
 
@@ -30,7 +30,7 @@ class ParamReader:
         """Time of the last request and number of requests, by name."""
         self._names: set[str] = set()
         self.values: dict[str, float] = {}
-        """Received values, sorted by name."""
+        """Received values."""
         self.request(names)
 
     def request(self, names: tuple[str, ...]) -> None:
@@ -50,10 +50,7 @@ class ParamReader:
         """Process a PARAM_VALUE, requested by anyone; store it if it is in the list."""
         self._open.pop(param.name, None)
         if param.name in self._names:
-            is_new = param.name not in self.values
             self.values[param.name] = param.value
-            if is_new:  # sort once per new name, not at every read
-                self.values = dict(sorted(self.values.items()))
 
     def absent(self, name: str) -> None:
         """Give up on a parameter that the vehicle does not have."""
@@ -79,8 +76,6 @@ class ParamReader:
 
 _AGAIN_NS = 2 * NS_PER_S
 """Time between attempts to read parameters that the vehicle did not send."""
-_MOST_TOLD = 100
-"""Largest number of advice texts per session: they quote values, which may change without end."""
 _FOLLOW_UPS = 3
 """Number of times that a command is sent, one second apart, since one may get lost."""
 
@@ -112,7 +107,6 @@ class VehicleParams:
         self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
-        self._has_asked_more = False
         self._again_ns = 0
         self._reader.request(tuple(name for name, _ in config.set_params))
         self._changes = TemporaryParams(
@@ -124,10 +118,7 @@ class VehicleParams:
         self._follow_ups_left = self._follow_up_ns = 0
         self._advised: ParamContext | None = None
         """Context of the last advice to the user."""
-        self._told: set[ParamNote] = set()
-        """Advice already given; the receiver is known later than the rest."""
-        self._assessed: tuple[ParamContext, Assessment] | None = None
-        """Assessment of all values, and its context."""
+        self._assessed: Assessment | None = None
         self.is_read = False
         """True if every parameter has arrived or was given up."""
         self.calibration: RcCalibration | None = None
@@ -143,7 +134,7 @@ class VehicleParams:
     @property
     def override_switch(self) -> int | None:
         """Number of the channel that enables the output, or None."""
-        return self._assessed[1].override_switch if self._assessed else None
+        return self._assessed.override_switch if self._assessed else None
 
     @property
     def ignores_receiver(self) -> bool:
@@ -174,7 +165,7 @@ class VehicleParams:
         is_armed = status is not None and status.armed
         if not is_armed or old is None or before is None:
             return
-        if after.endangers(before[1], accepted=self._config.accepted_risks):
+        if after.endangers(before, accepted=self._config.accepted_risks):
             self.interruption = because(
                 Code.PARAMETER_CHANGED, name=param.name, before=old, after=param.value
             )
@@ -188,10 +179,8 @@ class VehicleParams:
         return ParamContext(self._output, self._config.source_system, has_receiver)
 
     def _assess(self, status: VehicleStatus | None) -> Assessment:
-        context = self._context(status)
-        assessment = assess(self._profile, self._reader.values, context)
-        self._assessed = (context, assessment)
-        return assessment
+        self._assessed = assess(self._profile, self._reader.values, self._context(status))
+        return self._assessed
 
     def step(
         self, now_ns: int, status: VehicleStatus | None
@@ -222,22 +211,18 @@ class VehicleParams:
         return request._replace(kind=self._kinds.get(request.name, request.kind)).as_bytes()
 
     def _ask_for_missing(self, now_ns: int, status: VehicleStatus | None) -> None:
-        """Request parameters that depend on other values and, on the ground, missing ones."""
-        is_usable = self._assessed is not None and self._assessed[1].unusable is None
+        """Request missing parameters, on the ground."""
+        is_usable = self._assessed is not None and self._assessed.unusable is None
         is_flying = self.is_read and is_usable and status is not None and status.armed
         if now_ns < self._again_ns or is_flying:
             return
         self._again_ns = now_ns + _AGAIN_NS
-        values = self._reader.values
-        needed = self._profile.needed_params(values)
-        if not self._has_asked_more or any(name not in values for name in needed):
-            self._has_asked_more = True
-            self._reader.request((*needed, *self._profile.more_params(values)))
+        self._reader.request(self._profile.needed_params(self._reader.values))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
         self.is_read = True
-        assessment = self._assessed[1] if self._assessed else self._assess(status)
+        assessment = self._assessed or self._assess(status)
         if assessment.calibration == self.calibration:
             return
         is_armed = status is not None and status.armed
@@ -248,19 +233,17 @@ class VehicleParams:
 
     def _advise(self, status: VehicleStatus | None) -> None:
         context = self._context(status)
-        if self._config.pilot_hz is not None:
-            return  # we will send no sticks
-        if context.output is None or context == self._advised or not self._changes.is_settled:
+        has_output = context.output is not None and self._config.pilot_hz is None
+        if not has_output or context == self._advised or not self._changes.is_settled:
             return
         self._advised = context
-        notes = list(self._profile.advice(self._reader.values, context))
-        for danger in (*self._serial, *self._current(status).dangers):
+        assessment = self._current(status)
+        notes = [note for note in assessment.notes if note.kind == "advice"]
+        for danger in (*self._serial, *assessment.dangers):
             if danger.risk in self._config.accepted_risks:
-                notes.append(danger.accepted)
+                notes.append(danger.note(is_accepted=True))
         for note in notes:
-            if note not in self._told and len(self._told) < _MOST_TOLD:
-                self._told.add(note)
-                self._report(AdviceText(note.text))
+            self._report(AdviceText(note.text))
 
     def problem(self) -> Reason | None:
         """Return why no flight may begin yet with any output, or None."""
@@ -296,9 +279,9 @@ class VehicleParams:
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
         """Return the assessment for the present output and receiver."""
-        if self._assessed is None or self._assessed[0] != self._context(status):
+        if self._assessed is None or self._assessed.context != self._context(status):
             return self._assess(status)
-        return self._assessed[1]
+        return self._assessed
 
     def restore(self) -> bool:
         """Restore what was set for the flight; return True if nothing more can be done now."""

@@ -12,7 +12,7 @@ from mavbridge.commands.record import episodes
 from mavbridge.commands.record.episodes import Episodes, disk_left_gb, prepare_out
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
 PACKET = bytes(20)

@@ -18,7 +18,7 @@ from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.state import Freshness
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.codec.tlog import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
 

@@ -168,15 +168,6 @@ def test_a_bad_link_raises_no_alarm(
     assert world.run(20.0) is None
 
 
-def test_a_network_that_stalls_towards_us_raises_no_alarm() -> None:
-    world = engaged()
-    for _ in range(10):
-        world.delay_ms = 300.0  # what is sent now comes at once with what is sent later
-        assert world.run(0.3) is None
-        world.delay_ms = 1.0
-        assert world.run(1.0) is None
-
-
 def test_one_stray_release_of_another_station_raises_no_alarm() -> None:
     world = engaged(rc_jitter_ms=0.0)
     for _ in range(10):
@@ -228,14 +219,6 @@ def test_a_joystick_that_was_there_first_is_noticed(joystick_hz: float) -> None:
         assert after_s < (0.5 if fault == "returned" else CONFIRM_NS / S + 0.01)
 
 
-def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehicle() -> None:
-    world = engaged()
-    world.joystick, world.joystick_hz = still, 2000.0
-    fault, after_s = world.seconds_to_fault()
-    assert fault == "silent"
-    assert after_s < 0.5
-
-
 def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> None:
     world = engaged()
     world.start_joystick(50.0, after_ours_ms=2.0)
@@ -251,17 +234,26 @@ def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> N
 
 
 @pytest.mark.parametrize("sticks", [still, moving])
-@pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
-@pytest.mark.parametrize("rc_hz", [20.0, RC_CHANNELS_HZ])
+@pytest.mark.parametrize(
+    ("send_hz", "rc_hz"), [(30.0, 20.0), (100.0, RC_CHANNELS_HZ), (400.0, 20.0)]
+)
 def test_a_vehicle_that_hears_us_no_more_is_noticed_within_half_a_second(
     rc_hz: float, send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
-    for seed in range(10):
+    for seed in range(5):
         world = engaged(seed=seed, send_hz=send_hz, rc_hz=rc_hz, sticks=sticks)
         world.is_deaf = True
         fault, after_s = world.seconds_to_fault()
         assert fault == "silent"
         assert 0.3 < after_s < 0.5
+
+
+def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehicle() -> None:
+    world = engaged()
+    world.joystick, world.joystick_hz = still, 2000.0
+    fault, after_s = world.seconds_to_fault()
+    assert fault == "silent"
+    assert after_s < 0.5
 
 
 def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> None:
@@ -312,16 +304,6 @@ def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
 # --- the first echo
 
 
-def test_late_and_doubled_datagrams_are_left_out() -> None:
-    world = engaged()
-    stamp_us, now_ns = world.now_ns // 1000, world.now_ns
-    world.echo.received(STICKS, stamp_us + 1000, now_ns)
-    for _ in range(5):
-        world.echo.received(RECEIVER, stamp_us, now_ns)
-        world.echo.received(JOYSTICK, stamp_us + 1000, now_ns)
-    assert world.echo.fault(now_ns) is None
-
-
 def test_an_override_that_never_shows_up_fails_and_is_tried_again_later() -> None:
     world = World()
     world.is_deaf = True
@@ -366,18 +348,6 @@ def test_the_dither_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us:
         echo.sent(pwm_us, 1)
         echo.received(pwm_us, 2, 2)
         assert echo.confirmed
-
-
-def test_a_stamp_from_the_far_future_does_not_blind_the_echo_check() -> None:
-    """All that came after it was left out as late, and no flight could begin any more."""
-    echo = EchoCheck(OVERRIDE_ECHO)
-    echo.received(RECEIVER, 4_294_967_295_000, S)
-    for k in range(100):
-        now_ns = S + k * 20 * MS
-        echo.sent((*STICKS[:3], STICKS[3] - 4 * (k % 3)), now_ns)
-        echo.received((*STICKS[:3], STICKS[3] - 4 * (k % 3)), 70_000_000 + k * 20_000, now_ns)
-    assert echo.confirmed
-    assert echo.fault(now_ns) is None
 
 
 # --- release

@@ -1,6 +1,5 @@
 """Sticks by MANUAL_CONTROL and by overrides: the vehicle's curves, the echo, the release."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,7 +10,6 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import (
-    IDLE,
     NEUTRAL,
     ActionKind,
     ActionMeaning,
@@ -87,24 +85,11 @@ def test_the_curves_follow_the_mode_at_once_and_the_parameters_soon() -> None:
     assert flight.send(WANTED).shown[1] < before[1]  # type: ignore[index]
 
 
-def test_the_pilots_sticks_are_told_as_the_policy_would_mean_them() -> None:
-    flight = px4_flight(StickGains())
-    curves = PX4.stick_curves(PX4_VALUES, "ALTCTL", StickGains())
-    status = flight.vehicle.status(0)
-    theirs = replace(status, rc_sticks=curves.to_vehicle(WANTED), pilot_sticks=NEUTRAL)
-    told = flight.output.in_policy_terms(theirs, flight.session, flight.now_ns)
-    assert told.rc_sticks == pytest.approx(WANTED, abs=1e-6)
-    assert told.pilot_sticks == pytest.approx(NEUTRAL)
-    assert px4_flight().output.in_policy_terms(theirs, flight.session, flight.now_ns) is theirs
-
-
 def test_what_the_vehicle_cannot_do_is_told_once_and_counted() -> None:
     flight = px4_flight(StickGains(climb_mps=6.0))
     for _ in range(100):
         flight.send(Sticks(1.0, 0.0, 0.0, 0.0))
-    (note, *others) = flight.output.take_notes()
-    assert "climbs 3 m/s at most" in " ".join((note, *others))
-    assert flight.output.take_notes() == ()
+    assert "climbs 3 m/s at most" in flight.vehicle.texts[0]
     assert flight.output.saturated == {"throttle": 100}
 
 
@@ -252,11 +237,11 @@ def test_overrides_hide_the_receiver_from_the_first_one_on() -> None:
     flight = copter_flight()
     rest = RcChannels((1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500), 1)
     flight.receive(rest)
-    assert not flight.vehicle.is_receiver_hidden
+    assert not flight.vehicle.condition.is_receiver_hidden
     flight.send(NEUTRAL)
     flight.receive(rest._replace(boot_us=2))
-    assert flight.vehicle.is_receiver_hidden
-    assert not flight.vehicle.is_released
+    assert flight.vehicle.condition.is_receiver_hidden
+    assert not flight.vehicle.condition.is_released
 
 
 def test_other_actions_than_sticks_are_refused() -> None:
@@ -265,32 +250,22 @@ def test_other_actions_than_sticks_are_refused() -> None:
             flight.send(AttitudeThrust(0.5, 0.0, 0.0, 0.0))
 
 
-def test_idle_sticks_leave_by_both() -> None:
-    message: Any = px4_flight().message(px4_flight().send(IDLE))
-    assert message.z == 0
-    message = copter_flight().message(copter_flight().send(IDLE))
-    assert message.chan3_raw == 1100
-    descends_fast = px4_flight(StickGains(descent_mps=0.5))
-    message = descends_fast.message(descends_fast.send(IDLE))
-    assert message.z == 0  # the stop, and not half a metre a second
-
-
 # --- the choice
 
-USUAL: dict[tuple[str, ActionKind], Output] = {
-    ("ardupilot", "sticks"): "rc-override",
-    ("px4", "sticks"): "manual-control",
-}
 
-
-@pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
-@pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
+@pytest.mark.parametrize(
+    ("profile", "kind", "name"),
+    [
+        (ARDUPILOT, "sticks", "rc-override"),
+        (PX4, "sticks", "manual-control"),
+        *((PX4, kind, kind) for kind in ("attitude", "rates", "velocity")),
+    ],
+)
 def test_the_usual_output_follows_from_action_and_firmware(
-    profile: Profile, kind: ActionKind
+    profile: Profile, kind: ActionKind, name: Output
 ) -> None:
     chosen = choose_output(ActionMeaning(kind=kind), None, profile, codec())
-    assert chosen.name == USUAL.get((profile.name, kind), kind)
-    assert chosen.is_sticks == (kind == "sticks")
+    assert (chosen.name, chosen.is_sticks) == (name, kind == "sticks")
 
 
 @pytest.mark.parametrize(
