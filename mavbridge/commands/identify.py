@@ -16,7 +16,8 @@ from mavbridge.commands.step_response import (
     Channel,
     ResponseRecording,
     Sides,
-    measure_response,
+    fit_response,
+    settled_gain,
 )
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
@@ -40,9 +41,11 @@ from policy.motion.scripted import ScriptedPolicy
 from policy.motion.stick_loop import motion_of_sticks
 from policy.protocol import PolicyRunner
 
-STILL_S, LONGEST_GAP_S, CLIMB_S = 1.0, 0.25, 20.0
-"""Time used at the end of a pause; longest gap in sends of a flying policy; time for the climb
-before the doublet."""
+LEAST_R_SQUARED = 0.7
+EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
+"""Time by which a push ends early because of the smoothing's lag; time used before a push, and at
+the end of a pause; longest gap in sends of a flying policy; time for the climb before the
+doublet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +64,7 @@ class PushResult:
     dead_time_s: float
     time_63_s: float
     """Time from a step of the action to 63 % of its effect."""
+    r_squared: float
 
     @property
     def ratio(self) -> tuple[float | None, float | None]:
@@ -94,14 +98,14 @@ def trained_motion(contract: Contract, channel: Channel, amount: float) -> float
 def identify_pushes(
     recording: ResponseRecording, *, contract: Contract, program_start_s: float
 ) -> Identification:
-    """Measure every push of the doublet, which began at ``program_start_s`` on the clock of the
+    """Fit every push of the flown doublet, which began at ``program_start_s`` on the clock of the
     stamps; ``contract`` is of the policy to compare with."""
     pushes: list[PushResult] = []
     missing: list[str] = []
     channels = {channel.axis: channel for channel in CHANNELS[contract.action]}
     steps = doublet_steps(contract.action)
     for step in steps:
-        found = _measure_push(recording, channels[step.axis], step, contract, program_start_s)
+        found = _fit_push(recording, channels[step.axis], step, contract, program_start_s)
         if isinstance(found, PushResult):
             pushes.append(found)
         else:
@@ -116,7 +120,7 @@ def identify_pushes(
     return Identification(pushes=tuple(pushes), missing=tuple(missing), hover_thrust=hover)
 
 
-def _measure_push(
+def _fit_push(
     recording: ResponseRecording,
     channel: Channel,
     step: DoubletStep,
@@ -124,19 +128,27 @@ def _measure_push(
     program_start_s: float,
 ) -> PushResult | str:
     """Return the result of one push, or the reason why there is none."""
+    begin_s, end_s = program_start_s + step.begin_s, program_start_s + step.end_s
     input_s, inputs = recording.inputs(channel.column)
-    output_s, outputs = recording.outputs(channel)
-    input_s, inputs = input_s - program_start_s, inputs * channel.scale
-    within = (input_s >= step.begin_s) & (input_s <= step.end_s)
-    flown_s = np.concatenate([[step.begin_s], input_s[within], [step.end_s]])
-    if np.diff(flown_s).max() > LONGEST_GAP_S:
+    inputs = inputs * channel.scale
+    within = (input_s >= begin_s) & (input_s <= end_s)
+    if np.diff(np.concatenate([[begin_s], input_s[within], [end_s]])).max() > LONGEST_GAP_S:
         return "the policy did not fly all of it"
     up, down = float(inputs[within].max()), float(inputs[within].min())
     if up <= 0.0 or down >= 0.0:
         return "it was not pushed to both sides"
-    response = measure_response(input_s, inputs, output_s - program_start_s, outputs, step)
-    if isinstance(response, str):
-        return response
+    output_s, outputs = recording.outputs(channel)
+    data = (input_s, inputs, output_s, outputs)
+    up_gain, down_gain = (
+        settled_gain(*data, at_s - EARLY_S, step.half_s) for at_s in (begin_s + step.half_s, end_s)
+    )
+    known = None if up_gain is None or down_gain is None else (up_gain, down_gain)
+    # With known gains the first step gives the speed, because it began at rest.
+    last_s = (end_s if known is None else begin_s + step.half_s) - EARLY_S
+    shown = (output_s >= begin_s - BEFORE_S) & (output_s <= last_s)
+    response = fit_response(input_s, inputs, output_s[shown], outputs[shown], known)
+    if response is None or response.r_squared < LEAST_R_SQUARED:
+        return "the motion does not follow the action"
     gain_up, gain_down = response.gains
     return PushResult(
         axis=step.axis,
@@ -150,6 +162,7 @@ def _measure_push(
         ),
         dead_time_s=response.dead_time_s,
         time_63_s=response.dead_time_s + response.lag_s,
+        r_squared=response.r_squared,
     )
 
 
