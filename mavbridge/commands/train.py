@@ -17,7 +17,7 @@ from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
-from policy.engines.runner import require_devices
+from policy.engines.runner import require_device
 from policy.loading.builtin import builtin_config
 from policy.motion.stick_loop import rates_contract
 from policy.nets.toge import BuiltinConfig
@@ -34,7 +34,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
 
     Paths are flight folders, folders of them, or LeRobot datasets.
     """
-    require_devices(settings.device)
+    require_device(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
     flights = _read_flights(paths, settings)
     network = fit_to_flights(network, flights, settings)
@@ -43,7 +43,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
 
 def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings) -> int:
     """Train a world model; see ``run_policy_training``."""
-    require_devices(settings.device)
+    require_device(settings.device)
     config = WorldModelConfig(image_size=settings.image_size)
     flights = _read_flights(paths, settings)
     if (action := common_terms(flights).action) != "sticks":

@@ -45,10 +45,6 @@ class PolicyConfig(Ranged):
     """Inference engine; auto: the fastest that agrees with torch."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, mps."""
-    vision_device: Annotated[str | None, hidden("network.vision-device")] = None
-    """Device of the image encoder; default: --device."""
-    action_device: Annotated[str | None, hidden("network.action-device")] = None
-    """Device of the action head; default: --device."""
     seed: Annotated[int, Parameter(group=RARE), Between(0, 2**63 - 1)] = 0
     """Seed of random weights, diffusion noise and simulated courses."""
 

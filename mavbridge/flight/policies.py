@@ -56,8 +56,6 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
         allow_untrained=wanted.allow_untrained,
         engine=wanted.engine,
         device=wanted.device,
-        vision_device=wanted.vision_device,
-        action_device=wanted.action_device,
         dual_rate=wanted.dual_rate is not False,
         num_diffusion_steps=wanted.steps,
         by_rates=wanted.by_rates,

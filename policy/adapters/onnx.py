@@ -327,7 +327,7 @@ class OnnxGraphs:
             is_given = vision == action == "f32"
             policy, reset = in_float32 if is_given else self.at(vision, action)
             runner = make_runner(
-                *(policy, policy, run, run),
+                *(policy, run, run),
                 engine=engine_name(vision, action),
                 settings=settings,
                 compile_end=run,

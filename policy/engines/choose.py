@@ -114,7 +114,7 @@ def choose_runner(
             f"attribute: leave it out, and {settings.name} runs on torch"
         )
     if engine == "auto" and not isinstance(policy, BuiltinPolicy):
-        if settings.vision_device != "cpu" or settings.action_device != "cpu":
+        if settings.device != "cpu":
             return make_torch_runner(policy, settings), ()
         if hasattr(policy, "reset"):
             note = (
@@ -132,7 +132,7 @@ def first_that_agrees(
     """Return the first candidate that passes the check, or torch; and a line per skipped one."""
     notes: tuple[str, ...] = ()
     if candidates:
-        on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
+        on_cpu = replace(settings, device="cpu")
         samples = make_parity_samples(policy.contract)
         reference = make_torch_runner(policy, on_cpu)
         before = snapshot(policy)
@@ -196,14 +196,12 @@ def _impurity(
 def _candidates(
     policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
 ) -> list[Candidate]:
-    devices = {settings.vision_device.split(":")[0], settings.action_device.split(":")[0]}
-    if engine == "openvino" and devices != {"cpu"}:
-        raise PolicyError(f"network.engine=openvino runs on --device cpu, not on {sorted(devices)}")
-    if engine == "cuda-graph" and devices != {"cuda"}:
-        raise PolicyError(
-            f"network.engine=cuda-graph runs on --device cuda, not on {sorted(devices)}"
-        )
-    if devices == {"cpu"} and find_spec("openvino") is not None:
+    device = settings.device.partition(":")[0]
+    if engine == "openvino" and device != "cpu":
+        raise PolicyError(f"network.engine=openvino runs on --device cpu, not on {device}")
+    if engine == "cuda-graph" and device != "cuda":
+        raise PolicyError(f"network.engine=cuda-graph runs on --device cuda, not on {device}")
+    if device == "cpu" and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
         from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 
@@ -217,7 +215,7 @@ def _candidates(
         ]
     if engine == "openvino":
         raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")
-    if devices == {"cuda"} and torch.cuda.is_available():
+    if device == "cuda" and torch.cuda.is_available():
         from policy.engines.cuda_graph import make_cuda_graph_runner
 
         return [("cuda-graph", partial(make_cuda_graph_runner, policy, settings))]

@@ -2,7 +2,7 @@
 
 A replay launches hundreds of kernels in one call; otherwise an action head on a GPU spends its time
 on launches. Each path has its own stream, the action's with high priority, so a tick does not wait
-for an image. If both are on one GPU, the encoder's kernels still run between the action's kernels.
+for an image. The encoder's kernels still run between the action's kernels.
 
 Every graph reads and writes static memory. Inputs and results are copied through pinned memory on
 the graph's own stream, and the caller waits for an event after the last copy. So nothing of a
@@ -33,17 +33,11 @@ def make_cuda_graph_runner(policy: SingleRatePolicy, settings: ExecutionSettings
     """Capture a copy of the policy for the loops; tried once."""
     if not isinstance(policy, nn.Module):
         raise PolicyError(f"{settings.name} is no torch.nn.Module, so its work cannot be captured")
-    action_device = torch.device(settings.action_device)
-    vision_device = torch.device(settings.vision_device)
-    action = copy.deepcopy(policy).to(action_device).eval()
-    vision = action
-    if vision_device != action_device:
-        vision = copy.deepcopy(action).to(vision_device)
+    device = torch.device(settings.device)
     return make_runner(
-        vision,
-        action,
-        partial(_Graph, stream=_stream(vision_device, NORMAL_PRIORITY)),
-        partial(_Graph, stream=_stream(action_device, HIGH_PRIORITY)),
+        copy.deepcopy(policy).to(device).eval(),
+        partial(_Graph, stream=_stream(device, NORMAL_PRIORITY)),
+        partial(_Graph, stream=_stream(device, HIGH_PRIORITY)),
         engine=NAME,
         settings=settings,
     )

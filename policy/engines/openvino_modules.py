@@ -64,7 +64,7 @@ def make_module_runner(
         return lambda function, shapes: converter.compile(function, shapes, precision)
 
     return make_runner(
-        *(policy, policy, compile_as(vision), compile_as(action)),
+        *(policy, compile_as(vision), compile_as(action)),
         engine=engine_name(vision, action),
         settings=settings,
         compile_end=run_eagerly(settings.name, "cpu"),

@@ -23,8 +23,7 @@ class ExecutionSettings:
 
     name: str
     """The policy's name in messages."""
-    vision_device: str = "cpu"
-    action_device: str = "cpu"
+    device: str = "cpu"
     num_diffusion_steps: int = 10
     dual_rate: bool = True
     """``encode`` runs the image path; needs a ``DualRatePolicy``."""
@@ -38,8 +37,7 @@ Compile = Callable[[Callable[..., Any], Sequence[Shape]], ArrayFunction]
 
 
 def make_runner(
-    vision: SingleRatePolicy,
-    action: SingleRatePolicy,
+    policy: SingleRatePolicy,
     compile_vision: Compile,
     compile_action: Compile,
     *,
@@ -49,36 +47,35 @@ def make_runner(
 ) -> PolicyRunner:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
-    ``vision`` encodes images and ``action`` samples chunks: one policy, possibly on two devices.
     With ``compile_end``, for ``to_chunk``, only the network of a ``StepwisePolicy`` is compiled.
     """
-    contract, steps = action.contract, settings.num_diffusion_steps
+    contract, steps = policy.contract, settings.num_diffusion_steps
     rest = ((1, *contract.state_shape), (1, *contract.history_shape))
-    if compile_end is not None and isinstance(action, StepwisePolicy):
-        encode = _encoders(action, compile_vision)
-        act = _solver(action, compile_action, compile_end, settings)
+    if compile_end is not None and isinstance(policy, StepwisePolicy):
+        encode = _encoders(policy, compile_vision)
+        act = _solver(policy, compile_action, compile_end, settings)
         if settings.dual_rate:
             return assemble(contract, encode, act, engine, settings)
         return assemble(contract, (), _on_images(encode, act, contract), engine, settings)
     if not settings.dual_rate:
         predict = compile_action(
-            lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
+            lambda i, s, h: policy.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
         )
         return assemble(contract, (), predict, engine, settings)
-    if not isinstance(vision, DualRatePolicy) or not isinstance(action, DualRatePolicy):
+    if not isinstance(policy, DualRatePolicy):
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    encode, sampler = _encoders(vision, compile_vision), action
+    encode, sampler = _encoders(policy, compile_vision), policy
     fast = ((1, *contract.feature_shape), *rest)
     act = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
     return assemble(contract, encode, act, engine, settings)
 
 
-def _encoders(vision: DualRatePolicy, compile_vision: Compile) -> list[ArrayFunction]:
+def _encoders(policy: DualRatePolicy, compile_vision: Compile) -> list[ArrayFunction]:
     """Compile ``encode_visual`` for each camera, as a function of the image alone."""
-    contract = vision.contract
-    encode: Callable[..., Any] = vision.encode_visual
+    contract = policy.contract
+    encode: Callable[..., Any] = policy.encode_visual
     methods = [encode]
     if (cameras := len(contract.cameras)) > 1:
         methods = [lambda image, camera=i: encode(image, camera) for i in range(cameras)]
@@ -136,7 +133,7 @@ def to_numpy(array: Any) -> FloatArray:
 def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a numpy policy for the loops; tried once."""
     run = run_in_numpy(settings.name)
-    return make_runner(policy, policy, run, run, engine="numpy", settings=settings)
+    return make_runner(policy, run, run, engine="numpy", settings=settings)
 
 
 def run_in_numpy(name: str) -> Compile:
@@ -261,22 +258,19 @@ def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[in
         raise PolicyError(f"{runner.name}: {what} holds NaN or infinity on a dummy sample")
 
 
-def require_devices(*wanted: str) -> None:
-    """Raise PolicyError if a device is missing; imports torch only for a device other than cpu."""
-    others = sorted({*wanted} - {"cpu"})
-    if not others:
+def require_device(device: str) -> None:
+    """Raise PolicyError if a device is missing; imports torch only for one other than cpu."""
+    if device == "cpu":
         return
     import torch
 
     available = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
     if torch.backends.mps.is_available():
         available.append("mps")
-    for device in others:
-        if (device if device != "cuda" else "cuda:0") not in available:
-            built = ""
-            if device.startswith("cuda") and torch.version.cuda is None:
-                built = f" (torch {torch.__version__} is built without CUDA)"
-            raise PolicyError(
-                f"--device {device} is not available: this computer has {', '.join(available)}"
-                f"{built}"
-            )
+    if (device if device != "cuda" else "cuda:0") not in available:
+        built = ""
+        if device.startswith("cuda") and torch.version.cuda is None:
+            built = f" (torch {torch.__version__} is built without CUDA)"
+        raise PolicyError(
+            f"--device {device} is not available: this computer has {', '.join(available)}{built}"
+        )

@@ -3,7 +3,6 @@
 And what a user's policy holds: its modules, and the attributes that change from call to call.
 """
 
-import copy
 from collections.abc import Collection
 from functools import partial
 
@@ -19,24 +18,15 @@ NAME = "torch"
 def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a torch policy for the loops: numpy in and out, no gradients, tried once.
 
-    A module is moved to the action device, and copied to the vision device if that differs. In dual
-    rate, torch is set to one thread per operator in the whole process.
+    A module is moved to the device. In dual rate, torch is set to one thread per operator in the
+    whole process.
     """
     if settings.dual_rate:
         torch.set_num_threads(1)  # two loops infer at once: one core each, no contention
-    vision = action = policy
     if isinstance(policy, nn.Module):
-        policy.to(settings.action_device).eval()
-        if settings.vision_device != settings.action_device:
-            vision = copy.deepcopy(policy).to(settings.vision_device)
-    return make_runner(
-        vision,
-        action,
-        run_eagerly(settings.name, settings.vision_device),
-        run_eagerly(settings.name, settings.action_device),
-        engine=NAME,
-        settings=settings,
-    )
+        policy.to(settings.device).eval()
+    run = run_eagerly(settings.name, settings.device)
+    return make_runner(policy, run, run, engine=NAME, settings=settings)
 
 
 def run_eagerly(name: str, device: str) -> Compile:

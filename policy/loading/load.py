@@ -15,7 +15,7 @@ from policy.adapters.user_class import check_user_class, load_user_class
 from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.checkpoints.header import detect, read_contract
 from policy.contract import Contract
-from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_devices
+from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_device
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
@@ -60,7 +60,7 @@ def check_request(request: PolicyRequest) -> Contract | None:
         check_user_class(request.spec)
     if contract is not None:
         _require_image_size(contract, request.image_size)
-    require_devices(*request.devices)
+    require_device(request.device)
     return contract
 
 
@@ -116,8 +116,7 @@ def _settings(
         )
     return ExecutionSettings(
         name=request.spec,
-        vision_device=request.devices[0],
-        action_device=request.devices[1],
+        device=request.device,
         num_diffusion_steps=request.num_diffusion_steps,
         dual_rate=dual_rate,
     )
@@ -197,7 +196,7 @@ def _plan(request: PolicyRequest) -> Plan:
 
 def _onnx_files(request: PolicyRequest) -> OnnxFiles:
     path = _path(request)
-    if request.engine not in ("auto", "openvino") or set(request.devices) != {"cpu"}:
+    if request.engine not in ("auto", "openvino") or request.device != "cpu":
         flags = "network.engine and --device"
         raise PolicyError(f"--policy {request.spec} runs in OpenVINO on the CPU: leave out {flags}")
     return find_onnx_files(request.spec, path, request.contract_file)

@@ -64,10 +64,6 @@ class PolicyRequest:
     """Engine for the network; auto: the fastest that passes the parity check."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:0, mps."""
-    vision_device: str | None = None
-    """Device for encoding images, if different."""
-    action_device: str | None = None
-    """Device for sampling chunks, if different."""
     dual_rate: bool = True
     """A policy without a fast path becomes single-rate, with a note."""
     num_diffusion_steps: int = 10
@@ -79,11 +75,6 @@ class PolicyRequest:
     """Fly a built-in network, which computes sticks, by thrust and body rates."""
     starts_in_air: bool = False
     """The vehicle is already in the air at takeover: a scripted program does not climb."""
-
-    @property
-    def devices(self) -> tuple[str, str]:
-        """Devices for encoding images and for sampling chunks."""
-        return self.vision_device or self.device, self.action_device or self.device
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,7 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.checkpoints.networks import load_world_model
-from policy.engines.runner import require_devices
+from policy.engines.runner import require_device
 from policy.errors import Warned
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
@@ -147,7 +147,7 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
     Raises:
         PolicyError: no such device, or the weights cannot be used, or not with so many steps.
     """
-    require_devices(device)
+    require_device(device)
     model = load_world_model(world_model or SHIPPED)
     model.config.schedule.ddim_steps(ddim_steps)  # raises if that number is not possible
     return model.to(torch.device(device)).eval()

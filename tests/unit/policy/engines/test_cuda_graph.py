@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 SMALL = Contract(image_height=64, image_width=64)
-ON_GPU = ExecutionSettings(name="toge", vision_device="cuda", action_device="cuda")
+ON_GPU = ExecutionSettings(name="toge", device="cuda")
 
 
 def require_parity(policy: BuiltinPolicy) -> None:

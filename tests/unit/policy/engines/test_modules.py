@@ -176,6 +176,6 @@ def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.Monk
     ],
 )
 def test_an_engine_asked_for_on_the_wrong_device_is_refused(small_toge, engine, device, message):
-    settings = replace(SETTINGS, vision_device=device, action_device=device)
+    settings = replace(SETTINGS, device=device)
     with pytest.raises(PolicyError, match=message):
         choose_runner(small_toge, engine, settings)
