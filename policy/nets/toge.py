@@ -184,29 +184,17 @@ class BuiltinPolicy(nn.Module):
         feature: Tensor = self.visual_projection(self.backbone(image))
         return feature
 
-    def _fuse(self, feature: Tensor, state: Tensor, action_history: Tensor | None) -> Tensor:
+    def _sample(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         require_shape("state", state, self.contract.state_dim)
-        if action_history is None:
-            action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
-        require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
-        return self.condition(feature, self.state_encoder(state), action_history)
-
-    def encode_observation(
-        self, image: Tensor, state: Tensor, action_history: Tensor | None = None
-    ) -> Tensor:
-        """Encode image, state, history [B, K, 4] or None (no action sent) -> condition [B, C]."""
-        return self._fuse(self._encode(image), state, action_history)
+        require_shape("action_history", history, self.contract.history_len, ACTION_DIM)
+        condition = self.condition(feature, self.state_encoder(state), history)
+        return self.head.sample(condition, steps)
 
     def predict(
-        self,
-        image: Tensor,
-        state: Tensor,
-        action_history: Tensor | None = None,
-        num_diffusion_steps: int = 10,
+        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
         """Sample a chunk [B, horizon, 4] in [-1, 1] from image, state and history."""
-        condition = self.encode_observation(image, state, action_history)
-        return self.head.sample(condition, num_diffusion_steps)
+        return self._sample(self._encode(image), state, action_history, num_diffusion_steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,26 +229,12 @@ class Toge(BuiltinPolicy):
         """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
         return self._encode(image)
 
-    def encode_and_fuse(
-        self, feature: Tensor, state: Tensor, action_history: Tensor | None = None
-    ) -> Tensor:
-        """Fuse feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
-
-        None: no action was sent yet. In training, such histories are centred sticks.
-        """
-        require_shape("feature", feature, self.contract.feature_dim)
-        return self._fuse(feature, state, action_history)
-
     def predict_fast(
-        self,
-        feature: Tensor,
-        state: Tensor,
-        action_history: Tensor | None = None,
-        num_diffusion_steps: int = 10,
+        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
         """Sample a chunk from a cached feature: bit-identical to ``predict`` on its image."""
-        condition = self.encode_and_fuse(feature, state, action_history)
-        return self.head.sample(condition, num_diffusion_steps)
+        require_shape("feature", feature, self.contract.feature_dim)
+        return self._sample(feature, state, action_history, num_diffusion_steps)
 
 
 @dataclass(frozen=True, kw_only=True)

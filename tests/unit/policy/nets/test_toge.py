@@ -93,23 +93,8 @@ def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
         small_toge.encode_visual(image[..., :31])
     feature = small_toge.encode_visual(image)
     with pytest.raises(PolicyError, match=r"feature must be \[B, 256\]"):
-        small_toge.predict_fast(feature[:, :-1], state, history)
+        small_toge.predict_fast(feature[:, :-1], state, history, 1)
     with pytest.raises(PolicyError, match=r"state must be \[B, 13\]"):
-        small_toge.predict_fast(feature, state[0], history)
+        small_toge.predict_fast(feature, state[0], history, 1)
     with pytest.raises(PolicyError, match=r"action_history must be \[B, 4, 4\]"):
-        small_toge.predict_fast(feature, state, history[:, :3])
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
-def test_without_a_history_no_action_was_sent(kind: type[TogeConfig | ResnetUnetConfig]) -> None:
-    torch.manual_seed(0)
-    contract = Contract(image_height=32, image_width=32)
-    policy = build_policy(kind(backbone="resnet18", contract=contract)).eval()
-    image, state, history = sample()
-    centred = policy.encode_observation(image, state, history * 0)
-    assert torch.equal(policy.encode_observation(image, state), centred)
-    assert torch.equal(policy.predict(image, state), policy.predict(image, state, history * 0, 10))
-    if isinstance(policy, Toge):
-        feature = policy.encode_visual(image)
-        assert torch.equal(policy.encode_and_fuse(feature, state), centred)
+        small_toge.predict_fast(feature, state, history[:, :3], 1)
