@@ -17,7 +17,7 @@ from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.choose import chunks_of_samples, first_with_chunks, make_parity_samples
 from policy.engines.openvino_compile import (
     Graph,
-    GraphCompiler,
+    compile_graph,
     engine_name,
     precisions,
     signal_stack_kept,
@@ -117,8 +117,8 @@ class GraphFile:
             RuntimeError: OpenVINO cannot compile it.
         """
         shapes = [list(port.shape) for port in self._model.inputs]
-        compiler = GraphCompiler(f"{_digest(self._path, self._model)} {shapes}")
-        graph = compiler.compile("onnx", precision, lambda: self._model)
+        subject = f"{_digest(self._path, self._model)} {shapes}"
+        graph = compile_graph(subject, precision, lambda: self._model)
         return RoleGraph(graph, self.roles, self.hidden)
 
     def _hidden_pairs(self, model: "ov.Model", given: Mapping[str, str]) -> dict[str, str]:

@@ -9,18 +9,14 @@ import contextlib
 import ctypes
 import hashlib
 import io
-import logging
 import os
 import sys
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import openvino as ov
 import torch
-from torch import Tensor, nn
 
 from policy.contract import FloatArray
 from policy.engines.runner import Precision
@@ -140,40 +136,34 @@ def engine_name(vision: Precision, action: Precision) -> str:
     return f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
 
 
-class GraphCompiler:
-    """Compiles graphs; ``subject`` is a text that identifies the content of all of them."""
-
-    def __init__(self, subject: str) -> None:
-        self._core = ov.Core()
-        self._cache = CompileCache(user_cache_folder() / NAME)
-        digest = hashlib.sha256()
-        here = Path(__file__).parent
-        for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
-            digest.update(source.read_bytes())
-        cpu = self._core.get_property(DEVICE, "FULL_DEVICE_NAME")
-        capabilities = self._core.get_property(DEVICE, "OPTIMIZATION_CAPABILITIES")
-        versions = f"{ov.__version__} {torch.__version__}"
-        self._key = f"{subject} {digest.hexdigest()} {versions} {cpu} {capabilities}"
-
-    def compile(self, name: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "Graph":
-        """Compile the graph of ``build`` at a precision; ``name`` is unique in this compiler."""
-        properties = {
-            "PERFORMANCE_HINT": "LATENCY",
-            "NUM_STREAMS": "1",
-            "INFERENCE_NUM_THREADS": "1",
-            "ENABLE_CPU_PINNING": "NO",
-            "INFERENCE_PRECISION_HINT": precision,
-        }
-        key = f"{self._key} {name} {properties}"
-        stored = self._cache.load(key)
-        if stored is not None:
-            try:
-                return Graph(self._core.import_model(io.BytesIO(stored), DEVICE, properties))
-            except RuntimeError:
-                pass  # from another build: compile it again
-        compiled = self._core.compile_model(build(), DEVICE, properties)
-        self._cache.store(key, compiled.export_model().getvalue())
-        return Graph(compiled)
+def compile_graph(subject: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "Graph":
+    """Compile the graph of ``build``, or load it from the cache by ``subject``, which is a text
+    that identifies its content."""
+    properties = {
+        "PERFORMANCE_HINT": "LATENCY",
+        "NUM_STREAMS": "1",
+        "INFERENCE_NUM_THREADS": "1",
+        "ENABLE_CPU_PINNING": "NO",
+        "INFERENCE_PRECISION_HINT": precision,
+    }
+    core, cache, code = ov.Core(), CompileCache(user_cache_folder() / NAME), hashlib.sha256()
+    here = Path(__file__).parent
+    for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
+        code.update(source.read_bytes())
+    facts = [
+        core.get_property(DEVICE, n) for n in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")
+    ]
+    versions = f"{ov.__version__} {torch.__version__}"
+    key = f"{subject} {code.hexdigest()} {versions} {facts} {properties}"
+    stored = cache.load(key)
+    if stored is not None:
+        try:
+            return Graph(core.import_model(io.BytesIO(stored), DEVICE, properties))
+        except RuntimeError:
+            pass  # from another build: compile it again
+    compiled = core.compile_model(build(), DEVICE, properties)
+    cache.store(key, compiled.export_model().getvalue())
+    return Graph(compiled)
 
 
 class Graph:
@@ -202,40 +192,3 @@ class Graph:
     def rest(self) -> list[FloatArray]:
         """Return copies of the other outputs of the last run."""
         return [array.copy() for array in self._outputs[1:]]
-
-
-def update_digest(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
-    """Add a weight to a digest."""
-    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
-
-
-class Traceable(nn.Module):
-    """Module that wraps a function of tensors and holds the modules whose weights it uses."""
-
-    def __init__(self, held: nn.Module, function: Callable[..., Any]) -> None:
-        super().__init__()
-        self.held = held
-        self.function = function
-
-    def forward(self, *arrays: Tensor) -> Any:
-        """Call the function."""
-        return self.function(*arrays)
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Silence tracer and converter, and keep them from silencing other loggers permanently."""
-    level, disabled = logging.root.level, logging.root.manager.disable
-    fast_path = torch.backends.mha.get_fastpath_enabled()
-    try:
-        logging.disable(logging.CRITICAL)
-        # No converter knows the fused layer of torch's own transformers.
-        torch.backends.mha.set_fastpath_enabled(False)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # our shape checks warn; constants are right there
-            yield
-    finally:
-        torch.backends.mha.set_fastpath_enabled(fast_path)
-        logging.disable(disabled)
-        logging.root.setLevel(level)

@@ -7,8 +7,11 @@ the size and content of the graph before the slow conversion begins. A built-in 
 its configuration and weights.
 """
 
+import contextlib
 import hashlib
+import logging
 import re
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -18,12 +21,9 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from policy.engines.openvino_compile import (
-    GraphCompiler,
-    Traceable,
+    compile_graph,
     engine_name,
-    quiet,
     signal_stack_kept,
-    update_digest,
 )
 from policy.engines.runner import (
     ArrayFunction,
@@ -113,7 +113,7 @@ class ModuleConverter:
                     self._models[digest] = _converted(module, examples)
                 return self._models[digest]
 
-            return GraphCompiler(digest).compile("module", precision, build)
+            return compile_graph(digest, precision, build)
 
 
 def _float_tensor(result: object) -> Tensor:
@@ -205,3 +205,40 @@ def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:
 def _traced(module: nn.Module, examples: tuple[Tensor, ...]) -> Any:
     trace: Any = torch.jit.trace  # without types
     return trace(module, examples, check_trace=False, strict=False)
+
+
+def update_digest(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
+    """Add a weight to a digest."""
+    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+
+
+class Traceable(nn.Module):
+    """Module that wraps a function of tensors and holds the modules whose weights it uses."""
+
+    def __init__(self, held: nn.Module, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self.held = held
+        self.function = function
+
+    def forward(self, *arrays: Tensor) -> Any:
+        """Call the function."""
+        return self.function(*arrays)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Silence tracer and converter, and keep them from silencing other loggers permanently."""
+    level, disabled = logging.root.level, logging.root.manager.disable
+    fast_path = torch.backends.mha.get_fastpath_enabled()
+    try:
+        logging.disable(logging.CRITICAL)
+        # No converter knows the fused layer of torch's own transformers.
+        torch.backends.mha.set_fastpath_enabled(False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # our shape checks warn; constants are right there
+            yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast_path)
+        logging.disable(disabled)
+        logging.root.setLevel(level)

@@ -125,7 +125,7 @@ def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
 def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
     """Recompute the batch norms' statistics from images [B, 3, height, width].
 
-    The old ones were averaged while weights and image size changed, and fit neither.
+    The old ones were averaged while the weights changed, and fit neither weights nor plain images.
     """
     norms = [m for m in trainee.policy.backbone.modules() if isinstance(m, nn.BatchNorm2d)]
     if not norms:
