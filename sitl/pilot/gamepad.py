@@ -5,7 +5,15 @@ from collections.abc import Sequence
 import pygame
 
 from sitl.clock import Clock
-from sitl.pilot.transmitter import OFF_US, Gesture, Hand, PadAxes, Switch, Transmitter
+from sitl.pilot.transmitter import (
+    OFF_US,
+    Gesture,
+    Hand,
+    PadAxes,
+    Switch,
+    Transmitter,
+    pad_sticks,
+)
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
 """A, B, back and start on a common pad."""
@@ -85,7 +93,7 @@ class GamepadPilot:
         gesture: Gesture | None = "arm" if ARM_BUTTON in self._down else None
         if gesture is None and DISARM_BUTTON in self._down:
             gesture = "disarm"
-        hand = Hand(self._axes.sticks(self._pad.axes()), gesture, self._switch)
+        hand = Hand(pad_sticks(self._axes, self._pad.axes()), gesture, self._switch)
         return self._transmitter.channels_us(hand, now_ns)
 
     def close(self) -> None:

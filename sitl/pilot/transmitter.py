@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from sitl import UsageError
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
@@ -78,30 +78,8 @@ DEAD_ZONE = 0.08
 """Share of the travel to each side that counts as centred; springs return to within 0.05."""
 
 
-class Axis(NamedTuple):
-    """One axis by the system's number, from 0. A pad's vertical axes are negative upwards."""
-
-    number: int
-    is_reversed: bool
-
-
-class PadAxes(NamedTuple):
-    """Axis of each stick."""
-
-    throttle: Axis
-    yaw: Axis
-    pitch: Axis
-    roll: Axis
-
-    def sticks(self, values: Sequence[float]) -> StickPositions:
-        """Convert the pad's axis values to stick positions; an absent axis is 0."""
-        positions = []
-        for axis in self:
-            value = values[axis.number] if axis.number < len(values) else 0.0
-            positions.append(past_dead_zone(-value if axis.is_reversed else value))
-        return StickPositions(*positions)
-
-
+PadAxes: TypeAlias = dict[str, tuple[int, float]]
+"""Number of each stick's axis, from 0, and its sign. A pad's vertical axes are negative upwards."""
 DEFAULT_AXES = "throttle=-1,yaw=0,pitch=-4,roll=3"
 """Mode 2 on a common pad: the left stick climbs and turns, the right one leans."""
 
@@ -112,18 +90,20 @@ def parse_axes(text: str) -> PadAxes:
     Raises:
         UsageError: not exactly one axis number for each of the four sticks.
     """
-    found: dict[str, Axis] = {}
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(throttle|yaw|pitch|roll)=(-?)(\d{1,2})\s*", part)
-        if match is None or match[1] in found:
-            break
-        found[match[1]] = Axis(int(match[3]), is_reversed=match[2] == "-")
-    if len(found) != len(PadAxes._fields) or text.count(",") != len(found) - 1:
+    found = re.findall(r"(?:^|,)\s*(throttle|yaw|pitch|roll)=(-?)(\d{1,2})\s*(?=,|$)", text)
+    axes = {name: (int(number), -1.0 if minus else 1.0) for name, minus, number in found}
+    if len(axes) != len(StickPositions._fields) or text.count(",") != len(axes) - 1:
         raise UsageError(
             f"--pilot-axes {text}: give the axis of each stick, with a minus to reverse it, such "
             f"as {DEFAULT_AXES}"
         )
-    return PadAxes(**found)
+    return axes
+
+
+def pad_sticks(axes: PadAxes, values: Sequence[float]) -> StickPositions:
+    """Convert the pad's axis values to stick positions; an absent axis is 0."""
+    read = {name: values[k] * sign if k < len(values) else 0.0 for name, (k, sign) in axes.items()}
+    return StickPositions(**{name: past_dead_zone(value) for name, value in read.items()})
 
 
 def past_dead_zone(value: float) -> float:
