@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from faults.record import NEUTRAL_US, RECEIVER_US, Receiver
+from mavbridge.core.processes import free_port
 from sitl import UsageError
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_MS, Clock
@@ -127,8 +128,9 @@ class StallWatch(Worker):
 class Transmitter:
     """The pilot's eight channels, sent to ``--rc-in``; each keeps its value until it is moved."""
 
-    def __init__(self, port: int, receiver: Receiver) -> None:
+    def __init__(self, receiver: Receiver) -> None:
         """``receiver`` gives the rest position of the throttle."""
+        port = free_port()
         self.flags = ("--rc-in", str(port))
         """Flags of the simulated vehicle."""
         self._address = ("127.0.0.1", port)
@@ -159,8 +161,7 @@ class Viewer:
         spec = find_spec("rerun_cli")
         if spec is None or spec.origin is None:
             raise UsageError("a fault of the viewer needs Rerun's program: pip install rerun-sdk")
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            self._port: int = probe.getsockname()[1]
+        self._port = free_port(socket.SOCK_STREAM)
         binary = Path(spec.origin).parent / "rerun"
         self.process = subprocess.Popen(
             [binary, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(self._port)],

@@ -11,7 +11,7 @@ from faults.processes import StageError, leaks, thread_names
 from faults.props import StallWatch, Transmitter, Viewer
 from faults.record import NoVerdictError
 from faults.scenario import Scenario, Variant
-from faults.stage import CATALOGUE, Stage, faulty_policy, free_port, staged
+from faults.stage import CATALOGUE, Stage, faulty_policy, staged
 from faults.verdict import Verdict, judge
 from sitl.clock import Clock
 
@@ -48,7 +48,7 @@ def _fly_once(scenario: Scenario, verdict: Verdict, folder: Path, slack_ms: floa
     variant, threads = verdict.variant, thread_names()
     vehicle = ["--autopilot", variant.autopilot, "--receiver", variant.receiver]
     vehicle += ["--fly-on", f"{FLY_ON_S:g}"]
-    transmitter = Transmitter(free_port(), variant.receiver) if scenario.transmitter else None
+    transmitter = Transmitter(variant.receiver) if scenario.transmitter else None
     if transmitter is not None:
         vehicle += transmitter.flags
     at_ns, leans = 0, False

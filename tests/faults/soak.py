@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from faults.processes import StageError, status_of
 from faults.props import Transmitter
-from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from faults.stage import ORDERLY, Stage, faulty_policy, staged
 from faults.steps import Step, make_step
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.reasons import Code, because
@@ -89,7 +89,7 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
     ``folder`` is empty and gets the recording; ``report`` is called with a line now and then.
     """
     result = SoakResult(minutes=minutes)
-    transmitter = Transmitter(free_port(), "mid")
+    transmitter = Transmitter("mid")
     recording = folder / "recording"
     with staged(folder, "--receiver", "mid", *transmitter.flags, renders=False) as stage:
         stage.start(

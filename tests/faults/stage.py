@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from faults.processes import Process, StageError, child_of, mapped_memory, proce
 from faults.props import FrameFeed, Transmitter, Viewer
 from faults.record import VehicleReport
 from faults.relay import Relay
+from mavbridge.core.processes import free_port
 from mavbridge.core.reasons import Reason, reason_from_json
 from sitl.clock import NS_PER_MS, Clock
 
@@ -336,11 +336,3 @@ def staged(
             stage.camera = stack.enter_context(FrameFeed(shm, clock))
         stack.callback(stage.close)
         yield stage
-
-
-def free_port() -> int:
-    """Return a UDP port that is free on loopback."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

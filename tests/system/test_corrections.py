@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from faults.props import Transmitter
-from faults.stage import ORDERLY, free_port, staged
+from faults.stage import ORDERLY, staged
 from policy.data.flight_folders import leave_out_failed, read_flight
 
 pytestmark = pytest.mark.system
@@ -17,7 +17,7 @@ PITCH_CHANNEL, FORWARD_US, SWITCH = 2, 1300, 7
 
 
 def test_a_pilot_who_takes_over_by_the_switch_labels_the_flight(tmp_path: Path) -> None:
-    transmitter, recording = Transmitter(free_port(), "mid"), tmp_path / "recording"
+    transmitter, recording = Transmitter("mid"), tmp_path / "recording"
     with staged(tmp_path, "--receiver", "mid", *transmitter.flags) as flying:
         flying.start(*FLY, "--policy", "scripted:hover", "--record", str(recording))
         assert flying.wait_for("FLYING: the policy has control")
