@@ -40,7 +40,6 @@ from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import VehicleCommands
 from mavbridge.mavlink.session.discovery import (
     DuplicateSystems,
-    Hearing,
     VehicleDiscovery,
     VehicleIdentity,
 )
@@ -320,10 +319,9 @@ class MavlinkLink:
         place, timeout_s = self._config.connect, self._config.connect_timeout_s
         waited_s, heard = (now_ns - self._started_ns) / NS_PER_S, self._connection
         if waited_s > timeout_s and not self._discovery.is_settling:
-            hearing = Hearing(
+            why = self._discovery.describe(
                 parse_address(place), waited_s, heard.received_bytes, heard.received_packets
             )
-            why = self._discovery.describe(hearing)
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:

@@ -80,7 +80,7 @@ def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
     )
 
 
-def px4_motion(sticks: Sticks, values: dict[str, float], *, stabilized: bool = False) -> Motion:
+def px4_motion(sticks: Sticks, values: dict[str, float]) -> Motion:
     """Return PX4's motion for these sticks, by its formulas."""
 
     def shaped(stick: float, name: str) -> float:
@@ -92,8 +92,6 @@ def px4_motion(sticks: Sticks, values: dict[str, float], *, stabilized: bool = F
     tilt_deg = values["MPC_MAN_TILT_MAX"]
 
     def lean_deg(stick: float) -> float:
-        if stabilized:
-            return stick / length * tilt_deg
         return math.degrees(math.atan(stick / length * math.tan(math.radians(tilt_deg))))
 
     climb = shaped(sticks.throttle, "MPC_Z_MAN_EXPO")

@@ -15,9 +15,6 @@ PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
 PWM_LIMITS_US = (800, 2200)
 """PWM range of a radio. No other value is sent, even if the vehicle's calibration demands it."""
 
-DEAD_ZONE_US = 20
-"""ArduPilot's default RCn_DZ of roll and pitch."""
-
 FS_THR_MARGIN_US = 10
 """Margin of RC3_MIN above FS_THR_VALUE that ArduPilot's arming check demands."""
 
@@ -32,8 +29,6 @@ class RcChannel:
     trim_us: int
     max_us: int
     is_reversed: bool = False
-    dead_zone_us: int = DEAD_ZONE_US
-    """Deadband around the centre, to each side."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if the calibration cannot map sticks."""

@@ -2,6 +2,7 @@
 
 import hashlib
 import hmac
+from collections import Counter
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
@@ -68,9 +69,8 @@ class Signing:
         self._sent_ticks = state.sent_ticks
         self._remembered = dict(state.heard_ticks)
         self._heard: dict[Stream, int] = {}
-        self.refused: dict[Refusal, int] = {}
+        self.refused: Counter[Refusal] = Counter()
         """Number of refused packets by reason."""
-        self.accepted = 0
 
     @property
     def state(self) -> SigningState:
@@ -93,11 +93,9 @@ class Signing:
     def accepts(self, frame: RawPacket) -> bool:
         """True if a packet with a valid checksum is accepted; count refusals."""
         refusal = self._refusal(frame)
-        if refusal is None:
-            self.accepted += 1
-            return True
-        self.refused[refusal] = self.refused.get(refusal, 0) + 1
-        return False
+        if refusal is not None:
+            self.refused[refusal] += 1
+        return refusal is None
 
     def _refusal(self, frame: RawPacket) -> Refusal | None:
         if not frame.flags & SIGNED:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 from mavbridge.core.vehicle import StickGains
 from mavbridge.mavlink.codec.calibration import (
-    DEAD_ZONE_US,
     FS_THR_MARGIN_US,
     PWM_SIGN,
     RcCalibration,
@@ -168,7 +167,6 @@ def _channel(values: Mapping[str, float], number: int) -> RcChannel:
         trim_us=int(_require(values, f"RC{number}_TRIM")),
         max_us=int(_require(values, f"RC{number}_MAX")),
         is_reversed=bool(_require(values, f"RC{number}_REVERSED")),
-        dead_zone_us=int(values.get(f"RC{number}_DZ", DEAD_ZONE_US)),
     )
 
 

@@ -8,6 +8,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
+from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Body,
@@ -41,6 +42,8 @@ class VehicleCondition:
     def __init__(self, profile: Profile, *, min_battery_percent: float) -> None:
         self._profile = profile
         self._min_battery_percent = min_battery_percent
+        self.calibration: RcCalibration | None = None
+        """Radio calibration of the flight, if sticks pass through one."""
         self.heartbeat: tuple[int, Heartbeat] | None = None
         self._custom_mode = 0
         self._mode_ns: int | None = None
@@ -73,6 +76,8 @@ class VehicleCondition:
                 self._receive_heartbeat(body, arrived_ns)
             case CurrentMode():
                 self._receive_mode(body, arrived_ns)
+            case RcChannels():
+                self._receive_rc(body, arrived_ns)
             case Event(event_id):
                 self._receive_event(event_id, arrived_ns)
             case None:
@@ -119,21 +124,17 @@ class VehicleCondition:
         if not self._is_failsafe:
             self._is_failsafe, self._changed_ns = True, arrived_ns
 
-    def receive_rc(
-        self,
-        rc: RcChannels,
-        arrived_ns: int,
-        *,
-        channels_us: tuple[int, ...],
-        sticks: Sticks | None,
-    ) -> None:
-        """Process RC_CHANNELS with its four stick channels and the sticks that they mean."""
-        self._status = None
-        self.rc, self._rc_sticks = (arrived_ns, rc), sticks
+    def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
+        calibration, self.rc, self._rc_sticks = self.calibration, (arrived_ns, rc), None
+        pwm_us = calibration.stick_channels_us(rc.channels_us) if calibration else None
+        if calibration and pwm_us and all(pwm_us):
+            self._rc_sticks = calibration.to_sticks(pwm_us)
+        # Without a calibration, the sticks are by convention the first four channels.
+        channels_us = rc.channels_us[:4] if pwm_us is None else pwm_us
         if not self.is_receiver_hidden and channels_us:
             self._is_rc_plausible = all(value_us in RADIO_US for value_us in channels_us)
         if self.is_released and self.has_receiver:
-            self._pilot_sticks = sticks
+            self._pilot_sticks = self._rc_sticks
 
     @property
     def has_receiver(self) -> bool | None:

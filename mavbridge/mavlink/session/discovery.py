@@ -1,7 +1,6 @@
 """Discovery of the vehicle to fly among all senders on the link."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -132,8 +131,10 @@ class VehicleDiscovery:
                 return other
         return None
 
-    def describe(self, hearing: "Hearing") -> str:
-        """Describe the senders heard instead of the vehicle, with advice for this kind of link."""
+    def describe(
+        self, address: LinkAddress, waited_s: float, received_bytes: int, received_packets: int
+    ) -> str:
+        """Describe what was heard instead of the vehicle, with advice for this kind of link."""
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
@@ -150,56 +151,47 @@ class VehicleDiscovery:
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
                 "the vehicle's own port, or have the ground station forward it"
             )
-        return hearing.without_heartbeat()
-
-
-class Hearing(NamedTuple):
-    """Data received over a link on which no vehicle was found."""
-
-    address: LinkAddress
-    waited_s: float
-    received_bytes: int
-    received_packets: int
-    """Number of MAVLink packets in the received bytes."""
-
-    def without_heartbeat(self) -> str:
-        """Explain why no heartbeat was heard, as far as known, and what to do."""
-        amount = f"{self.received_bytes / 1000 / max(self.waited_s, 0.1):.1f} kB/s came"
-        if self.received_packets:
+        amount = f"{received_bytes / 1000 / max(waited_s, 0.1):.1f} kB/s came"
+        if received_packets:
             return (
                 f"{amount}, MAVLink without a heartbeat of any sender: the link loses most of it, "
                 "or a router filters HEARTBEAT"
             )
-        match self.address:
-            case SerialAddress(baud=baud) if self.received_bytes:
-                return (
-                    f"{amount}, and no MAVLink in it: another baud rate than {baud}, or another "
-                    "protocol on the vehicle's port (SERIALn_PROTOCOL 2 on ArduPilot, MAV_n_CONFIG "
-                    "on PX4)"
-                )
-            case SerialAddress(baud=baud):
-                return (
-                    f"the port is silent at {baud} baud: is the vehicle powered, are TX and RX "
-                    "crossed, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
-                    "MAV_n_CONFIG on PX4)?"
-                )
-            case _ if self.received_bytes:
-                return f"{amount}, and no MAVLink in it: another program sends to this port"
-            case TcpAddress(port=port):
-                return (
-                    f"connected, and not a byte came: a simulator serves one client on TCP {port}: "
-                    "end the other one (a ground station, MAVProxy), or use another of its ports"
-                )
-            case UdpAddress(listens=True, port=port):
-                return (
-                    f"heard nothing: is the vehicle running, and does it send to port {port} of "
-                    "this computer? (udp: listens, udpout: calls)"
-                )
-            case _:
-                return (
-                    "nobody answered: is the vehicle running, and does it listen at this address? "
-                    "(udpout: calls, udp: listens)"
-                )
+        return _silence(address, amount if received_bytes else None)
+
+
+def _silence(address: LinkAddress, amount: str | None) -> str:
+    """Explain why no MAVLink was heard; ``amount``: the bytes received instead, in words."""
+    match address:
+        case SerialAddress(baud=baud) if amount:
+            return (
+                f"{amount}, and no MAVLink in it: another baud rate than {baud}, or another "
+                "protocol on the vehicle's port (SERIALn_PROTOCOL 2 on ArduPilot, MAV_n_CONFIG "
+                "on PX4)"
+            )
+        case SerialAddress(baud=baud):
+            return (
+                f"the port is silent at {baud} baud: is the vehicle powered, are TX and RX "
+                "crossed, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
+                "MAV_n_CONFIG on PX4)?"
+            )
+        case _ if amount:
+            return f"{amount}, and no MAVLink in it: another program sends to this port"
+        case TcpAddress(port=port):
+            return (
+                f"connected, and not a byte came: a simulator serves one client on TCP {port}: "
+                "end the other one (a ground station, MAVProxy), or use another of its ports"
+            )
+        case UdpAddress(listens=True, port=port):
+            return (
+                f"heard nothing: is the vehicle running, and does it send to port {port} of "
+                "this computer? (udp: listens, udpout: calls)"
+            )
+        case _:
+            return (
+                "nobody answered: is the vehicle running, and does it listen at this address? "
+                "(udpout: calls, udp: listens)"
+            )
 
 
 class DuplicateSystems:

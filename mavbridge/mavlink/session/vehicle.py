@@ -184,12 +184,14 @@ class VehicleSession:
         """Process one message from this vehicle."""
         self._streams.receive(message.name, arrived_ns)
         body = message.body
+        self.condition.calibration = self.calibration
         self.condition.receive(body, arrived_ns)
         match body:
             case Attitude():
                 self._watch_boot(body.boot_us // 1000, arrived_ns)
-            case RcChannels():
-                self._receive_rc(body, arrived_ns)
+            case RcChannels(channels_us) if (switch := self.params.override_switch) is not None:
+                in_range = switch <= len(channels_us)
+                self._switch.read(channels_us[switch - 1] if in_range else 0, arrived_ns)
             case CommandAck():
                 self._streams.receive_ack(body)
             case ParamValue():
@@ -206,22 +208,6 @@ class VehicleSession:
     def _show(self, *texts: str) -> None:
         for text in texts:
             self.report(said_by_vehicle(text))
-
-    def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
-        calibration = self.calibration
-        pwm_us = calibration.stick_channels_us(rc.channels_us) if calibration else None
-        self.condition.receive_rc(
-            rc,
-            arrived_ns,
-            # Without a calibration, the sticks are by convention the first four channels.
-            channels_us=rc.channels_us[:4] if pwm_us is None else pwm_us,
-            sticks=calibration.to_sticks(pwm_us)
-            if calibration and pwm_us and all(pwm_us)
-            else None,
-        )
-        if (switch := self.params.override_switch) is not None:
-            in_range = switch <= len(rc.channels_us)
-            self._switch.read(rc.channels_us[switch - 1] if in_range else 0, arrived_ns)
 
     def _watch_boot(self, boot_ms: int, arrived_ns: int) -> None:
         back_us = -later_by_us(1000 * boot_ms, 1000 * self._boot_ms)
@@ -300,9 +286,7 @@ class VehicleSession:
             return because(Code.HEARTBEAT_LOST)
         if self._upset is not None and now_ns - self._upset[0] < _UPSET_NS:
             return self._upset[1]
-        if (unfinished := self.unfinished(now_ns)) is not None:
-            return unfinished
-        return self.params.problem()
+        return self.unfinished(now_ns) or self.params.problem()
 
     def end_engagement(self, reason: Reason, now_ns: int) -> None:
         """Make ``problem`` return this reason, for long enough to end an engagement in order."""

@@ -190,67 +190,59 @@ LOITER, LAND = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
 ARMED_BY, DISARMED_BY, FAILSAFE_HOLD = 0x190CAF3, 0x1F46777, 0x1D11DF6
 
 
-def test_px4s_mode_is_the_newest_of_two_messages() -> None:
+def beat(mode: int, *, armed: bool = True, state: int = 4) -> Heartbeat:
+    return Heartbeat(2, 12, 81 | 128 * armed, mode, state)
+
+
+@pytest.mark.parametrize(
+    "story",
+    [
+        [
+            (0, CurrentMode(POSCTL, POSCTL), "POSCTL"),
+            (90, beat(ALTCTL, armed=False), "POSCTL"),  # sent before the change, or overtaken by it
+            (1000, beat(LAND), "AUTO.LAND armed"),  # CURRENT_MODE got lost
+            (0, CurrentMode(LAND, LAND), "AUTO.LAND armed"),  # no news
+            (10, beat(RTL), "AUTO.RTL armed"),
+        ],
+        [
+            (0, Event(ARMED_BY), "ALTCTL armed"),
+            (50, beat(ALTCTL, armed=False), "ALTCTL armed"),
+            (1000, beat(ALTCTL), "ALTCTL armed"),
+            (0, Event(FAILSAFE_HOLD), "ALTCTL armed failsafe"),
+            (0, Event(DISARMED_BY), "ALTCTL failsafe"),
+            (1000, beat(ALTCTL), "ALTCTL armed"),  # the event was another's, or it was armed again
+        ],
+        [
+            # Disarmed, it falls back to what could arm; armed, it has left the mode by itself.
+            (0, CurrentMode(LOITER, POSCTL), "AUTO.LOITER"),
+            (1000, beat(POSCTL), "POSCTL armed"),
+            (0, CurrentMode(POSCTL, 0), "POSCTL armed"),  # it does not say
+            (0, CurrentMode(LOITER, POSCTL), "AUTO.LOITER armed failsafe"),
+            (50, beat(POSCTL), "AUTO.LOITER armed failsafe"),
+            (1000, beat(LOITER, state=5), "AUTO.LOITER armed failsafe"),
+            (0, CurrentMode(LAND, LAND), "AUTO.LAND armed failsafe"),
+            (1000, beat(LAND), "AUTO.LAND armed"),
+        ],
+    ],
+    ids=["mode", "arming", "failsafe"],
+)
+def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
+    story: list[tuple[int, Body, str]],
+) -> None:
     session = Session("px4")
-    assert session.status.mode == "ALTCTL"
-    session.put(CurrentMode(POSCTL, POSCTL))
-    assert session.status.mode == "POSCTL"
-    session.now_ns += 90 * MS
-    session.heartbeat(mode=ALTCTL)  # sent before the change, or overtaken by it
-    assert session.status.mode == "POSCTL"
-    session.now_ns += S
-    session.heartbeat(mode=LAND)  # CURRENT_MODE got lost
-    assert session.status.mode == "AUTO.LAND"
-    session.put(CurrentMode(LAND, LAND))  # no news
-    session.now_ns += 10 * MS
-    session.heartbeat(mode=RTL)
-    assert session.status.mode == "AUTO.RTL"
-    assert not session.status.is_failsafe
+    for after_ms, body, expected in story:
+        session.now_ns += after_ms * MS
+        session.put(body)
+        status = session.status
+        told = (status.mode, status.armed and "armed", status.is_failsafe and "failsafe")
+        assert " ".join(filter(None, told)) == expected
 
 
-def test_px4s_arming_is_told_by_an_event_at_once() -> None:
-    session = Session("px4")
-    assert not session.status.armed
-    session.put(Event(ARMED_BY))
-    assert session.status.armed
-    ardupilot = Session()
-    for event in (ARMED_BY, FAILSAFE_HOLD):  # numbers of PX4's mean nothing there
-        ardupilot.put(Event(event))
-    assert (ardupilot.status.armed, ardupilot.status.is_failsafe) == (False, False)
-    session.now_ns += 50 * MS
-    session.heartbeat(armed=False)
-    assert session.status.armed
-    session.now_ns += S
-    session.heartbeat(armed=True)
-    session.put(Event(FAILSAFE_HOLD))
-    assert session.status.is_failsafe
-    session.put(Event(DISARMED_BY))
-    assert not session.status.armed
-    session.now_ns += S
-    session.heartbeat(armed=True)  # the event was another's, or it was armed again
-    assert session.status.armed
-
-
-def test_a_mode_that_px4_has_left_by_itself_is_a_failsafe() -> None:
-    session = Session("px4")
-    session.put(CurrentMode(LOITER, POSCTL))
-    assert not session.status.is_failsafe  # disarmed, it falls back to what could arm
-    session.now_ns += S
-    session.heartbeat(armed=True, mode=POSCTL)
-    session.put(CurrentMode(POSCTL, 0))  # it does not say
-    assert not session.status.is_failsafe
-    session.put(CurrentMode(LOITER, POSCTL))
-    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LOITER", True)
-    session.now_ns += 50 * MS
-    session.heartbeat(armed=True, mode=POSCTL)
-    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LOITER", True)
-    session.now_ns += S
-    session.heartbeat(armed=True, mode=LOITER, state=5)
-    assert session.status.is_failsafe
-    session.put(CurrentMode(LAND, LAND))
-    session.now_ns += S
-    session.heartbeat(armed=True, mode=LAND)
-    assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LAND", False)
+def test_px4s_events_mean_nothing_to_ardupilot() -> None:
+    session = Session()
+    for event in (ARMED_BY, FAILSAFE_HOLD):
+        session.put(Event(event))
+    assert (session.status.armed, session.status.is_failsafe) == (False, False)
 
 
 def test_px4s_events_without_a_text_are_shown_and_its_long_texts_put_together() -> None:

@@ -246,9 +246,7 @@ class VehicleParams:
             self._report(AdviceText(note.text))
 
     def problem(self) -> Reason | None:
-        """Return why no flight may begin yet with any output, or None."""
-        if not self.is_read:
-            return because(Code.READING_PARAMETERS)
+        """Return why no flight may begin yet with any output, or None; once all is read."""
         return self._changes.problem()
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:

@@ -114,33 +114,25 @@ def test_where_each_output_is_shown(profile: Profile) -> None:
     ("profile", "values", "output", "has_receiver", "expected"),
     [
         (ARDUPILOT, {"GUID_TIMEOUT": 3.0}, "velocity", True, ["--set GUID_TIMEOUT=0.5"]),
-        (ARDUPILOT, {"GUID_TIMEOUT": 0.5}, "velocity", True, []),
         (ARDUPILOT, {"FS_THR_ENABLE": 1.0}, "velocity", False, ["--set FS_THR_ENABLE=0"]),
         (ARDUPILOT, {"FS_THR_ENABLE": 1.0}, "velocity", None, []),  # not known yet
-        (ARDUPILOT, {"FS_THR_ENABLE": 0.0}, "velocity", False, []),
         (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "attitude", True, ["ATC_ANGLE_BOOST is 0"]),
         (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "rates", True, []),
-        (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "velocity", True, []),
-        (ARDUPILOT, {"ATC_ANGLE_BOOST": 1.0}, "attitude", True, []),
         (ARDUPILOT, {"GUID_TIMEOUT": 3.0, "ATC_ANGLE_BOOST": 0.0}, None, False, []),
-        (PX4, {}, "manual-control", None, []),
         (PX4, {"COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}, "manual-control", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0}, "manual-control", None, ["--set COM_RC_LOSS_T=0.5"]),
         (PX4, {"COM_RC_LOSS_T": 0.1}, "manual-control", None, ["as short as that is a failsafe"]),
         (PX4, {"NAV_RCL_ACT": 6.0}, "manual-control", None, ["NAV_RCL_ACT is 6: it would disarm"]),
-        (PX4, {"NAV_RCL_ACT": 5.0}, "manual-control", None, ["terminate the flight"]),
         (
             *(PX4, {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 20.0}),
             *("manual-control", None),
             ["--set MPC_TILTMAX_AIR=35"],
         ),
-        (PX4, {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 45.0}, "manual-control", None, []),
         (PX4, {"MPC_THR_CURVE": 1.0}, "manual-control", None, ["--set MPC_THR_CURVE=0"]),
         (PX4, {"MPC_THR_CURVE": 1.0, "MPC_TILTMAX_AIR": 1.0}, "rates", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", None, []),
         (PX4, {"COM_OF_LOSS_T": 5.0}, "velocity", None, ["--set COM_OF_LOSS_T=0.5"]),
         (PX4, {"COM_OBL_RC_ACT": 7.0}, "rates", None, ["COM_OBL_RC_ACT is 7: it would disarm"]),
-        (PX4, {"COM_OF_LOSS_T": 5.0, "COM_RC_LOSS_T": 2.0}, None, None, []),
     ],
 )
 def test_advice(
