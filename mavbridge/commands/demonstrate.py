@@ -319,7 +319,7 @@ def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -
         engine=runner.engine,
         mode="dual",
         action_hz=Rates().loops(is_dual=True).action_hz,
-        visual_hz=Rates().visual_limits_hz[1],
+        visual_hz=Rates().visual_rate,
         contract=runner.contract,
         course_seed=spec.seed,
         seed=spec.seed,

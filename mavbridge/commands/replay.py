@@ -29,8 +29,10 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, load_configured_policy
+from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
@@ -44,7 +46,7 @@ from mavbridge.simulation.replay.compare import (
     guard_traces,
     other_traces,
 )
-from mavbridge.simulation.replay.guard import chunk_of, recorded_plan, replay_guard, replay_other
+from mavbridge.simulation.replay.guard import recorded_plan, replay_guard, replay_other
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
 from policy.protocol import PolicyRunner
@@ -70,7 +72,8 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     steps = replay_guard(source)
     flown = replace(source, config=other_config(source.config, config))
     plan, engine = recorded_plan(flown), source.meta.engine or ""
-    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+    frame = action_frame(source.contract)
+    chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
     compared: PolicyComparison | None = None
     if chosen != "chunks":
         clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
@@ -83,7 +86,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         # The new chunks, by the serial numbers of the recorded ones.
         chunks = {
             pair.recorded.serial: chunk_of(
-                replace(pair.replayed, serial=pair.recorded.serial), runner.contract
+                replace(pair.replayed, serial=pair.recorded.serial), action_frame(runner.contract)
             )
             for pair in pairs
             if pair.replayed is not None

@@ -59,7 +59,7 @@ def prepare_to_die_first() -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
+def settle_guard(*, realtime: bool) -> str | None:
     """Prepare the guard process, which has one thread. Call after construction.
 
     Its memory is locked in RAM, and ``realtime`` schedules it before all ordinary threads; its
@@ -71,19 +71,16 @@ def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
     gc.collect()
     gc.freeze()
     refusals = [
-        _pin("the guard", cpu),
         _use_fifo(GUARD_FIFO_PRIORITY, "the guard") if realtime else None,
         _lock_memory(),
     ]
     return "; ".join(filter(None, refusals)) or None
 
 
-def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
+def settle_thread() -> str | None:
     """Schedule the calling thread of the flight process; return what was refused, or None."""
-    if (refusal := _pin("a loop", cpu)) is not None:
-        return refusal
     # On a single CPU a slow policy would leave nothing to the thread that watches over it.
-    if not realtime or usable_cores() == 1:
+    if usable_cores() == 1:
         return None
     # Threads that the policy starts are ordinary again, or several could hold every CPU.
     return _use_fifo(ACTION_FIFO_PRIORITY, "the policy")
@@ -94,18 +91,6 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _pin(who: str, cpu: int | None) -> str | None:
-    if cpu is None:
-        return None
-    if not hasattr(os, "sched_setaffinity"):
-        return f"{who} cannot be kept on CPU {cpu}: {platform.system()} has no such setting"
-    try:
-        os.sched_setaffinity(0, {cpu})
-    except OSError as error:
-        return f"{who} cannot run on CPU {cpu} ({error.strerror}): it runs where the system puts it"
-    return None
 
 
 def _use_fifo(priority: int, who: str) -> str | None:

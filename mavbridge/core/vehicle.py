@@ -208,6 +208,11 @@ class VehicleStatus:
     stick_override_ns: int | None = None
     """When it last reported that moving sticks have changed its mode."""
 
+    @property
+    def height_m(self) -> float | None:
+        """Height above the estimator's origin; None without a position."""
+        return None if self.position_ned_m is None else -self.position_ned_m[2]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeRoles:
@@ -311,8 +316,7 @@ class Outlet(NamedTuple):
     """Address for datagrams; None on a stream."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ActionTrace:
+class ActionTrace(NamedTuple):
     """One action's way from the policy to the wire."""
 
     raw: Action

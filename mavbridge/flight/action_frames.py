@@ -33,14 +33,8 @@ class ActionFrame:
         return tuple(map(kind._make, self._other_axes(actions).tolist()))
 
     def from_guard(self, actions: Sequence[Action]) -> FloatArray:
-        """Convert sent actions to the policy's frame, [len, 4].
-
-        An action of another kind becomes neutral: while it prepares the vehicle, or levels one that
-        is flown by body rates, the guard sends actions that the policy does not know.
-        """
-        kind = type(self.neutral)
-        own = [action if type(action) is kind else self.neutral for action in actions]
-        return self._other_axes(np.array(own, dtype=np.float32))
+        """Convert sent actions of the policy's kind to its frame, [len, 4]."""
+        return self._other_axes(np.array(actions, dtype=np.float32))
 
     def _other_axes(self, actions: FloatArray) -> FloatArray:
         if self.order == (0, 1, 2, 3) and self.signs == (1.0, 1.0, 1.0, 1.0):

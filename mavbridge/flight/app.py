@@ -30,7 +30,7 @@ from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.guard_process import StartedGuard, start_guard
+from mavbridge.flight.guard_process import GuardProcess, start_guard
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
 from mavbridge.flight.plan import FlightPlan, plan_flight
@@ -75,7 +75,7 @@ def fly(config: FlyConfig) -> int:
     ):
         check_flight(config)
         guard = start_guard(config, clock, stack)  # finds the vehicle while the weights load
-        guard.process.wait_until_open()
+        guard.wait_until_open()
         loaded = load_configured_policy(
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
@@ -101,7 +101,7 @@ def fly_policy(
     clock: Clock,
     console: Console,
     sinks: tuple[TickSink, ...] = (),
-    guard: StartedGuard | None = None,
+    guard: GuardProcess | None = None,
 ) -> int:
     """Run one flight of a loaded policy; return the exit status.
 
@@ -119,7 +119,7 @@ def fly_policy(
             flight = _Flight(plan, clock, console, runner, guard, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
-            guard.process.send(plan.guard)
+            guard.send(plan.guard)
             flight.run(stop)
         return flight.verdict(stop)
     except MavbridgeError as error:
@@ -141,14 +141,14 @@ class _Flight:
         clock: Clock,
         console: Console,
         runner: PolicyRunner,
-        guard: StartedGuard,
+        guard: GuardProcess,
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
         config = self._config = plan.config
         self._clock = clock
         self._stack = stack
-        self._guard = guard.process
+        self._guard = guard
         self._has_hung = False
         self._ending = EndRequest(reason=because(Code.GUARD_DIED), is_fault=True)
         """Reason for which the guard was asked to end. Until it is asked, it ends without a summary
@@ -175,9 +175,7 @@ class _Flight:
             for source in config.camera.sources_of(contract.cameras)
         ]
         self._observers.open_viewer(stack)
-        self._observers.open_recorder(
-            guard.tlog_pipe, self._guard, lambda: self._bridge.view.status.autopilot
-        )
+        self._observers.open_recorder(guard, lambda: self._bridge.view.status.autopilot)
         self._bridge: Bridge = build_bridge(
             plan,
             runner,
@@ -223,22 +221,17 @@ class _Flight:
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""
-        rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
+        bridge, screen = self._bridge, self._observers.screen
         visions = [
             Worker(
                 "mavbridge-vision" if number == 0 else f"mavbridge-vision-{self._cameras[number]}",
-                self._scheduled(vision.run, realtime=False, cpu=rates.vision_cpu),
+                vision.run,
             )
             for number, vision in enumerate(bridge.visions)
         ]
-        act = self._scheduled(bridge.policy.run, realtime=rates.realtime, cpu=rates.action_cpu)
-        policy = Worker("mavbridge-policy", act)
+        policy = Worker("mavbridge-policy", self._scheduled(bridge.policy.run))
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
-        listen = self._scheduled(
-            partial(self._guard.listen, view=bridge.view),
-            realtime=rates.realtime,
-            cpu=rates.action_cpu,
-        )
+        listen = self._scheduled(partial(self._guard.listen, view=bridge.view))
         listener = Worker("mavbridge-guard", listen)
         settle_process()
         # Joined in reverse: the guard has ended before anything that feeds it is closed.
@@ -265,12 +258,12 @@ class _Flight:
         self._guard.send("engage" if key == ENGAGE_KEY else "release")
 
     def _scheduled(
-        self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
+        self, run: Callable[[threading.Event], None]
     ) -> Callable[[threading.Event], None]:
         """Wrap a loop so that its thread sets its scheduling first."""
 
         def run_settled(stop: threading.Event) -> None:
-            refusal = settle_thread(realtime=realtime, cpu=cpu)
+            refusal = settle_thread() if self._config.rates.realtime else None
             if refusal is not None:
                 self._observers.screen.show_message(refusal)
             run(stop)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 from contextlib import ExitStack, suppress
-from typing import NamedTuple
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import SocketAddress
@@ -82,6 +81,8 @@ class GuardProcess:
         """Messages received before ``listen``."""
         self.summary: GuardSummary | None = None
         """Final summary; None until the guard has ended in order."""
+        self.tlog_pipe: TlogPipe | None = None
+        """Telemetry log of a flight that is recorded."""
         self.error: MavbridgeError | None = None
         """Error that ended the guard."""
         self.send(settings)
@@ -245,29 +246,20 @@ def _as_exception(error: GuardError) -> MavbridgeError:
             )
 
 
-class StartedGuard(NamedTuple):
-    """A guard that is looking for the vehicle, and the pipe of its telemetry log."""
-
-    process: GuardProcess
-    tlog_pipe: TlogPipe | None
-
-
-def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
+def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> GuardProcess:
     """Start the guard process. Closing ``stack`` closes its channel, which ends it."""
-    tlog_pipe: TlogPipe | None = None
-    tlog_fd: int | None = None
-    if config.record is not None:
-        tlog_pipe = open_tlog_pipe()
+    tlog_pipe = None if config.record is None else open_tlog_pipe()
+    if tlog_pipe is not None:
         stack.callback(tlog_pipe.close)
-        tlog_fd = tlog_pipe.writer.fileno()
     settings = guard_settings(
         config,
         is_dual=config.policy.may_be_dual,
-        tlog_fd=tlog_fd,
+        tlog_fd=None if tlog_pipe is None else tlog_pipe.writer.fileno(),
         wall_offset_ns=wall_offset_ns(clock),
     )
-    process = GuardProcess(settings, clock)
-    stack.callback(process.close)
+    guard = GuardProcess(settings, clock)
+    stack.callback(guard.close)
+    guard.tlog_pipe = tlog_pipe
     if tlog_pipe is not None:
         tlog_pipe.writer.close()
-    return StartedGuard(process, tlog_pipe)
+    return guard

@@ -60,7 +60,9 @@ class SentHistory:
     def at(self, at_ns: int, plan: Chunk | None = None) -> Action:
         """Return the action flown at a time, of the policy's kind, in NED and FRD axes.
 
-        ``plan``: chunk that is flown from the end of its solve on.
+        An action of another kind is neutral: while it prepares the vehicle, or levels one that is
+        flown by body rates, the guard sends actions that the policy does not know. ``plan``: chunk
+        that is flown from the end of its solve on.
         """
         if plan is not None and at_ns >= plan.computed_ns:
             return plan.action_at(at_ns)
@@ -83,10 +85,5 @@ class SentHistory:
 
         ``plan``: as in ``at``, for a time that is still to come.
         """
-        if plan is not None:
-            return self._frame.from_guard([self.at(at_ns - age, plan) for age in self._ages_ns])[
-                None
-            ]
-        with self._lock:
-            rows = [self._sent[bisect_right(self._sent_ns, at_ns - age)] for age in self._ages_ns]
+        rows = [self.at(at_ns - age_ns, plan) for age_ns in self._ages_ns]
         return self._frame.from_guard(rows)[None]

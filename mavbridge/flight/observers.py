@@ -35,7 +35,6 @@ from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.recording.tlog import TlogPipe
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
@@ -63,7 +62,7 @@ class FlightObservers:
         self._runner = runner
         self._clock = clock
         self._mode: Mode = "dual" if plan.is_dual else "single"
-        action_hz, vision_hz = plan.loops.action_hz, plan.loops.max_vision_hz
+        action_hz, vision_hz = plan.loops.action_hz, plan.loops.vision_hz
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
         )
@@ -111,7 +110,7 @@ class FlightObservers:
             return
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
-            vision_hz=self._plan.loops.max_vision_hz,
+            vision_hz=self._plan.loops.vision_hz,
             chunk_hz=self._plan.loops.action_hz,
             stick_hz=config.rates.stick_rate,
             contract=contract,
@@ -128,15 +127,13 @@ class FlightObservers:
         )
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 
-    def open_recorder(
-        self, tlog_pipe: TlogPipe | None, guard: GuardProcess, autopilot: Callable[[], str]
-    ) -> None:
+    def open_recorder(self, guard: GuardProcess, autopilot: Callable[[], str]) -> None:
         """Start the recorder if --record is given.
 
         Raises:
             UserError: the folder cannot be written.
         """
-        if self._config.record is None or tlog_pipe is None:
+        if self._config.record is None or guard.tlog_pipe is None:
             return
         from mavbridge.recording.meta import FlightMeta
         from mavbridge.recording.recorder import Recorder
@@ -152,7 +149,7 @@ class FlightObservers:
             engine=self._runner.engine,
             mode=self._mode,
             action_hz=self._plan.loops.action_hz,
-            visual_hz=self._plan.loops.max_vision_hz,
+            visual_hz=self._plan.loops.vision_hz,
             contract=self._runner.contract,
             seed=self._config.policy.seed,
             plan=self._plan.figures(),
@@ -167,7 +164,7 @@ class FlightObservers:
             self._recorder = Recorder(
                 self._config.record,
                 meta,
-                tlog_pipe=tlog_pipe,
+                tlog_pipe=guard.tlog_pipe,
                 packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
                 autopilot=autopilot,
                 report=self.screen.show_message,

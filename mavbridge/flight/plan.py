@@ -7,12 +7,11 @@ from mavbridge.config.rates import LoopRates
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.flight.settings import (
     TAU_S,
+    action_limits,
     action_meaning,
     effective_freshness,
     engagement_settings,
     envelope_limits,
-    limit_settings,
-    policy_envelope,
     require_goal,
 )
 from mavbridge.guard.chunks import FreshnessLimits
@@ -42,7 +41,7 @@ class FlightPlan:
             self.guard.envelope,
         )
         return {
-            "vision_hz": self.loops.max_vision_hz,
+            "vision_hz": self.loops.vision_hz,
             "action_hz": self.loops.action_hz,
             "stick_hz": self.config.rates.stick_rate,
             "state_hz": self.loops.state_hz,
@@ -76,10 +75,10 @@ def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> Flig
         meaning=action_meaning(contract, config.link),
         output=None if config.link.output == "auto" else config.link.output,
         smoothing=Smoothing(
-            limits=limit_settings(config).of(contract.action),
+            limits=action_limits(config, contract.action),
             tau_s=TAU_S[contract.action] if limits.tau is None else limits.tau,
         ),
-        envelope=envelope_limits(config.envelope, policy_envelope(contract)),
+        envelope=envelope_limits(config.envelope, contract),
         engagement=engagement_settings(config, contract),
         watches_home_height="height" in contract.state_extras,
         watches_position=bool({"goal", "altitude"} & set(contract.state_extras)),

@@ -2,35 +2,27 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
-from mavbridge.core.vehicle import Action, Telemetry
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.core.vehicle import Telemetry
+from mavbridge.flight.action_frames import ActionFrame, action_frame
+from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.forward_state import ForwardState
-from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import (
-    FrozenStateCheck,
-    Observation,
-    ObservationSource,
-    StateReader,
-)
-from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.state import FrozenStateCheck, Observation, ObservationSource
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
-
-Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""Signature of ``PolicyRunner.act``."""
+from policy.protocol import PolicyRunner
 
 WAIT_NS = 100 * NS_PER_MS
 """Longest wait for an attitude before the stop flag is checked and the guard is told."""
@@ -44,23 +36,6 @@ MAX_HORIZON = 1024
 """Most actions in a chunk, as in a contract: the guard reads each one between two sends."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PolicySettings:
-    """Settings of the policy loop."""
-
-    action_frame: ActionFrame
-    chunk_dt_s: float
-    max_frozen_ns: int
-    """Longest time for which the attitude may stay bit-identical; 0: no limit."""
-    forward: ForwardState | None = None
-    """Predicts the state to the time at which the chunk acts; None: the state as measured."""
-    prefix_len: int = 0
-    """Committed actions behind the action history."""
-    period_ns: int
-    """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
-    one."""
-
-
 class PolicyLoop:
     """Solves on each new attitude, at most at the policy's rate, in its own thread.
 
@@ -69,31 +44,41 @@ class PolicyLoop:
 
     def __init__(
         self,
+        plan: FlightPlan,
+        runner: PolicyRunner,
         *,
         clock: Clock,
         view: TelemetryCache,
-        reader: StateReader,
-        observations: ObservationSource,
-        history: SentHistory,
-        act: Act,
-        reset: Callable[[], None],
+        caches: Sequence[FeatureCache],
         send: Callable[[Chunk | NoChunk], object],
-        settings: PolicySettings,
         watch: Callable[[Solve], object] | None = None,
     ) -> None:
+        """Join a policy, telemetry and the caches of its cameras, in the contract's order.
+
+        ``send`` hands a chunk to the guard, or the reason why there is none; ``watch`` is given
+        every solve, and must not block.
+        """
+        contract = plan.contract
+        self._runner = runner
         self._clock = clock
         self._view = view
-        self._reader = reader
-        self._observations = observations
-        self._history = history
-        self._act = act
-        self._reset = reset
+        self._observations = ObservationSource(
+            contract, caches=caches, join=runner.join, max_age_ns=plan.start_limits.feature_ns
+        )
         self._send = send
-        self._settings = settings
         self._watch = watch
-        self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
+        self._action_frame = action_frame(contract)
+        self._step_ns = round(contract.chunk_dt_s * NS_PER_S)
+        self._prefix_len = contract.prefix_len
+        self._period_ns = plan.guard.chunk_period_ns
+        """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
+        one."""
+        self._forward = ForwardState(contract) if contract.state_time == "execution" else None
+        """Predicts the state to the time at which the chunk acts."""
+        self._frozen = FrozenStateCheck(
+            max_frozen_ns=round(plan.config.limits.max_frozen_state * NS_PER_S)
+        )
         self._serial = 0
-        self._forward = settings.forward
         self._chunk: Chunk | None = None
         """Last chunk that was sent."""
         self._solves_ns: deque[int] = deque(maxlen=RECENT_SOLVES)
@@ -136,7 +121,7 @@ class PolicyLoop:
         """Earliest arrival of an attitude that starts the next solve."""
         if self._due_ns is None or self._is_starting:
             return self._seen_ns + 1
-        return self._due_ns - self._settings.period_ns // 4
+        return self._due_ns - self._period_ns // 4
 
     @property
     def _is_starting(self) -> bool:
@@ -154,17 +139,16 @@ class PolicyLoop:
         telemetry, has_position = self._view.telemetry, self._view.status.has_position
         attitude = telemetry.ned_from_body_wxyz
         self._seen_ns = 0 if attitude is None else attitude.arrived_ns
-        period_ns = self._settings.period_ns
         due_ns = now_ns if self._due_ns is None or is_starting else self._due_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
-        self._due_ns = max(due_ns, now_ns - period_ns // 2) + period_ns * 99 // 100
+        self._due_ns = max(due_ns, now_ns - self._period_ns // 2) + self._period_ns * 99 // 100
         if is_starting:
             self._reset_ns = now_ns
-            self._reset()
+            self._runner.reset()
         for past in self._view.take_past(self._seen_ns):
-            if (before := self._reader.past(past, has_position=has_position)) is not None:
-                self._observations.remember(before)
-        state = self._reader.read(telemetry, now_ns, has_position=has_position)
+            if (before := self._view.reader.past(past, has_position=has_position)) is not None:
+                self._observations.push(before)
+        state = self._view.reader.read(telemetry, now_ns, has_position=has_position)
         if isinstance(state, Reason):
             self._refuse(state)
             return
@@ -183,10 +167,10 @@ class PolicyLoop:
             return frozen
         if self._forward is not None and plan is not None:
             acts_ns = self._takeover_ns(now_ns)
-            ahead = self._forward.at(telemetry, acts_ns, partial(self._history.at, plan=plan))
+            ahead = self._forward.at(telemetry, acts_ns, partial(self._view.history.at, plan=plan))
             if ahead is not telemetry:
                 has_position = self._view.status.has_position
-                acting = self._reader.read(ahead, acts_ns, has_position=has_position)
+                acting = self._view.reader.read(ahead, acts_ns, has_position=has_position)
                 if isinstance(acting, Reason):
                     return acting
                 state = acting
@@ -199,7 +183,7 @@ class PolicyLoop:
 
     def _refuse(self, reason: Reason) -> None:
         if self._due_ns is not None:
-            soon_ns = self._clock.now_ns() + RETRY_NS + self._settings.period_ns // 4
+            soon_ns = self._clock.now_ns() + RETRY_NS + self._period_ns // 4
             self._due_ns = min(self._due_ns, soon_ns)
         self._send(NoChunk(reason))
 
@@ -208,18 +192,17 @@ class PolicyLoop:
     ) -> None:
         """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured;
         ``plan`` is the chunk that flies, if one does."""
-        feature, acts_ns = observation.feature, observation.state.attitude_ns
+        acts_ns = observation.state.attitude_ns
         if self._forward is None or plan is None:
-            history = self._history.resample(now_ns)
+            history = self._view.history.resample(now_ns)
         else:
-            history = self._history.resample(acts_ns, plan)
-        step_ns = round(self._settings.chunk_dt_s * NS_PER_S)
-        if count := self._settings.prefix_len:
-            times_ns = range(acts_ns, acts_ns + count * step_ns, step_ns)
-            prefix = self._history.committed(plan, times_ns, self._takeover_ns(now_ns))
+            history = self._view.history.resample(acts_ns, plan)
+        if self._prefix_len:
+            times_ns = range(acts_ns, acts_ns + self._prefix_len * self._step_ns, self._step_ns)
+            prefix = self._view.history.committed(plan, times_ns, self._takeover_ns(now_ns))
             history = np.concatenate([history, prefix], axis=1)
         try:
-            array = self._act(observation.encoded, observation.states, history)
+            array = self._runner.act(observation.encoded, observation.states, history)
         except NoChunkError as error:
             self._refuse(because(Code.POLICY_REFUSED, said=str(error)))
             return
@@ -231,91 +214,44 @@ class PolicyLoop:
             return
         self._serial += 1
         self._solves_ns.append(done_ns - now_ns)
-        self._view.remember(
-            SolveInputs(
-                serial=self._serial,
-                state=state,
-                feature_frame_id=feature.frame_id,
-                feature_captured_ns=feature.captured_ns,
-                computed_ns=done_ns,
-                predict_ns=done_ns - now_ns,
-            )
-        )
-        chunk = make_chunk(
-            self._serial,
-            state,
-            self._settings.action_frame.to_guard(array[0]),
-            image_ns=observation.image_ns,
+        solve = Solve(
+            serial=self._serial,
+            started_ns=now_ns,
             computed_ns=done_ns,
-            first_ns=acts_ns,
-            step_ns=step_ns,
             reset_ns=self._reset_ns,
+            state=state,
+            states=_kept(observation.states),
+            history=_kept(history),
+            frame_ids=observation.frame_ids,
+            image_ns=observation.image_ns,
+            first_ns=acts_ns,
+            step_ns=self._step_ns,
+            actions=_kept(array),
         )
-        self._chunk = chunk
-        self._send(chunk)
+        self._view.remember(solve, observation.captured_ns)
+        self._chunk = chunk_of(solve, self._action_frame)
+        self._send(self._chunk)
         if self._watch is not None:
-            self._watch(_solve_of(chunk, state, observation, history, array, started_ns=now_ns))
+            self._watch(solve)
 
 
-def _solve_of(
-    chunk: Chunk,
-    state: VehicleState,
-    observation: Observation,
-    history: FloatArray,
-    array: FloatArray,
-    *,
-    started_ns: int,
-) -> Solve:
-    return Solve(
-        serial=chunk.serial,
-        started_ns=started_ns,
-        computed_ns=chunk.computed_ns,
-        reset_ns=chunk.reset_ns,
-        state=state,
-        states=_kept(observation.states),
-        history=_kept(history),
-        frame_ids=observation.frame_ids,
-        image_ns=chunk.image_ns,
-        first_ns=chunk.first_ns,
-        step_ns=chunk.step_ns,
-        actions=_kept(array),
-    )
+def chunk_of(solve: Solve, frame: ActionFrame) -> Chunk:
+    """Return the chunk of a solve, with the oldest stamp of each input that it came from.
 
-
-def make_chunk(
-    serial: int,
-    state: VehicleState,
-    actions: tuple[Action, ...],
-    *,
-    image_ns: int,
-    computed_ns: int,
-    first_ns: int,
-    step_ns: int,
-    reset_ns: int,
-) -> Chunk:
-    """The chunk of a solve from ``state``, with the oldest stamp of each input that it came from.
-
-    Args:
-        serial: its number.
-        state: the newest as measured, whose ages count.
-        actions: what the policy returned, in NED and FRD axes.
-        image_ns: exposure of the oldest among the newest images of all cameras.
-        computed_ns: end of the solve.
-        first_ns: time at which the first action acts: the attitude's that the policy was given.
-        step_ns: time from one action to the next.
-        reset_ns: when the policy was last reset before it; 0: when it was loaded.
+    ``frame``: axes of the policy's actions.
     """
+    state = solve.state
     velocity_ns = min(state.velocity_ns, state.specific_force_ns)
     return Chunk(
-        serial=serial,
+        serial=solve.serial,
         attitude_ns=min(state.attitude_ns, state.rate_ns),
         velocity_ns=velocity_ns if state.extras_ns is None else min(velocity_ns, state.extras_ns),
-        image_ns=image_ns,
-        computed_ns=computed_ns,
-        first_ns=first_ns,
-        step_ns=step_ns,
-        actions=actions,
-        reset_ns=reset_ns,
+        image_ns=solve.image_ns,
+        computed_ns=solve.computed_ns,
+        first_ns=solve.first_ns,
+        step_ns=solve.step_ns,
+        actions=frame.to_guard(solve.actions[0]),
+        reset_ns=solve.reset_ns,
     )
 
 

@@ -12,14 +12,10 @@ from mavbridge.core.link_settings import LinkSettings, SigningFiles
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.limits import LimitSettings
-from mavbridge.guard.memory import EngagementSettings
-from mavbridge.guard.sequences import DisengageSettings, EngageSettings
+from mavbridge.guard.limits import ActionLimits
 from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import EngagementSettings
 from policy.contract import ActionKind, Contract
-
-LEAST = 1e-9
-"""Limit that widens nothing."""
 
 TAU_S: dict[ActionKind, float] = {"sticks": 0.05, "rates": 0.01, "attitude": 0.05, "velocity": 0.05}
 """Default time constants of the low-pass filter. A policy of body rates closes the attitude loop,
@@ -40,7 +36,6 @@ def guard_settings(
             min_battery_percent=config.envelope.min_battery,
         ),
         realtime=config.rates.realtime,
-        cpu=config.rates.guard_cpu,
         tlog_fd=tlog_fd,
         keeps_packets=tlog_fd is not None,
         wall_offset_ns=wall_offset_ns,
@@ -61,29 +56,40 @@ def require_goal(config: FlyConfig, contract: Contract) -> None:
         )
 
 
-def limit_settings(config: FlyConfig) -> LimitSettings:
-    """Return the limits of sent actions, for every kind."""
-    bounds = config.setpoints
-    return LimitSettings(
-        stick_slew_per_s=config.limits.max_slew,
-        lean_rad=math.radians(bounds.setpoint_lean),
-        rate_radps=math.radians(bounds.setpoint_rate),
-        yaw_rate_radps=math.radians(bounds.setpoint_yaw_rate),
-        thrust=bounds.setpoint_thrust,
-        speed_mps=bounds.setpoint_speed,
-        climb_mps=bounds.setpoint_climb,
-        accel_mps2=bounds.setpoint_accel,
-    )
-
-
-def policy_envelope(contract: Contract) -> EnvelopeLimits:
-    """Return the envelope that the policy needs; limits that its contract omits widen nothing."""
-    return EnvelopeLimits(
-        tilt_deg=contract.max_tilt_deg or LEAST,
-        height_m=contract.max_height_m or LEAST,
-        speed_mps=contract.max_speed_mps or LEAST,
-        distance_m=contract.max_distance_m or LEAST,
-    )
+def action_limits(config: FlyConfig, kind: ActionKind) -> ActionLimits:
+    """Return the limits of sent actions of one kind."""
+    bounds, free = config.setpoints, math.inf
+    lean, rate = math.radians(bounds.setpoint_lean), math.radians(bounds.setpoint_rate)
+    yaw, thrust = math.radians(bounds.setpoint_yaw_rate), bounds.setpoint_thrust
+    match kind:
+        case "sticks":
+            slew = config.limits.max_slew or free
+            return ActionLimits(low=(-1.0,) * 4, high=(1.0,) * 4, change_per_s=(slew,) * 4)
+        case "rates":
+            return ActionLimits(
+                low=(0.0, -rate, -rate, -yaw),
+                high=(thrust, rate, rate, yaw),
+                change_per_s=(free,) * 4,
+            )
+        case "attitude":
+            return ActionLimits(
+                low=(0.0, -lean, -lean, -yaw),
+                high=(thrust, lean, lean, yaw),
+                change_per_s=(free, rate, rate, free),
+                pair=(1, 2),
+            )
+        case "velocity":
+            speed, climb, accel = (
+                bounds.setpoint_speed,
+                bounds.setpoint_climb,
+                bounds.setpoint_accel,
+            )
+            return ActionLimits(
+                low=(-speed, -speed, -climb, -yaw),
+                high=(speed, speed, climb, yaw),
+                change_per_s=(accel, accel, accel, free),
+                pair=(0, 1),
+            )
 
 
 def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSettings:
@@ -95,22 +101,19 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
             f"--mode {mode}: this policy flies in {' or '.join(contract.modes)} only, since its "
             "actions mean something else, or nothing, in other modes"
         )
-    is_setpoint = contract.action != "sticks"
     return EngagementSettings(
-        engage=EngageSettings(
-            modes=contract.modes, mode=mode, takeoff_m=config.takeoff, is_setpoint=is_setpoint
-        ),
+        modes=contract.modes,
+        mode=mode,
+        is_setpoint=contract.action != "sticks",
         arm=config.arm,
+        takeoff_m=config.takeoff,
         engage_channel=config.engage_channel,
         engage_on_arm=config.engage_on_arm,
         readonly=config.link.readonly,
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-        disengage=DisengageSettings(
-            on_fault=config.on_fault,
-            then=config.then,
-            is_setpoint=is_setpoint,
-            keeps_place=contract.stops_at_end,
-        ),
+        on_fault=config.on_fault,
+        then=config.then,
+        keeps_place=contract.stops_at_end,
     )
 
 
@@ -168,16 +171,29 @@ def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
     )
 
 
-def envelope_limits(config: EnvelopeConfig, policy: EnvelopeLimits | None) -> EnvelopeLimits:
+def envelope_limits(config: EnvelopeConfig, contract: Contract) -> EnvelopeLimits:
     """Return the defaults widened to the policy's needs, overridden by the flags."""
-    limits = EnvelopeLimits() if policy is None else EnvelopeLimits().widened(policy)
-    return replace(
-        limits,
-        tilt_deg=limits.tilt_deg if config.max_tilt is None else config.max_tilt,
-        height_m=limits.height_m if config.max_height is None else config.max_height,
-        speed_mps=limits.speed_mps if config.max_speed is None else config.max_speed,
-        distance_m=limits.distance_m if config.max_distance is None else config.max_distance,
+
+    def limit(default: float, needed: float | None, asked: float | None) -> float:
+        return max(default, needed or 0.0) if asked is None else asked
+
+    usual = EnvelopeLimits()
+    return EnvelopeLimits(
+        tilt_deg=limit(usual.tilt_deg, contract.max_tilt_deg, config.max_tilt),
+        height_m=limit(usual.height_m, contract.max_height_m, config.max_height),
+        speed_mps=limit(usual.speed_mps, contract.max_speed_mps, config.max_speed),
+        distance_m=limit(usual.distance_m, contract.max_distance_m, config.max_distance),
     )
+
+
+_AGES = {
+    "state_ns": ("max_state_age_s", "max_attitude_age"),
+    "velocity_ns": ("max_velocity_age_s", "max_velocity_age"),
+    "feature_ns": ("max_feature_age_s", "max_feature_age"),
+    "chunk_ns": ("max_chunk_age_s", "max_chunk_age"),
+    "stall_ns": ("max_stall_s", "max_stall"),
+}
+"""Fields of ``FreshnessLimits``, of the contract and of ``Limits``."""
 
 
 def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
@@ -186,24 +202,16 @@ def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
     Raises:
         UserError: a flag would loosen a limit of the contract.
     """
-    return FreshnessLimits(
-        state_ns=_tightened_ns(contract.max_state_age_s, "attitude_age", limits.max_attitude_age),
-        velocity_ns=_tightened_ns(
-            contract.max_velocity_age_s, "velocity_age", limits.max_velocity_age
-        ),
-        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature_age", limits.max_feature_age),
-        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk_age", limits.max_chunk_age),
-        stall_ns=_tightened_ns(contract.max_stall_s, "stall", limits.max_stall),
-    )
-
-
-def _tightened_ns(allowed_s: float, what: str, asked_s: float | None) -> int:
-    if asked_s is not None and asked_s > allowed_s:
-        raise UserError(
-            f"limits.{what}={asked_s:g} is looser than the {allowed_s:g} s of this policy's "
-            "contract: give less, or leave it out"
-        )
-    return round((allowed_s if asked_s is None else asked_s) * NS_PER_S)
+    ages_ns: dict[str, int] = {}
+    for name, (own, flag) in _AGES.items():
+        allowed_s, asked_s = getattr(contract, own), getattr(limits, flag)
+        if asked_s is not None and asked_s > allowed_s:
+            raise UserError(
+                f"limits.{flag.removeprefix('max_')}={asked_s:g} is looser than the {allowed_s:g} "
+                "s of this policy's contract: give less, or leave it out"
+            )
+        ages_ns[name] = round((allowed_s if asked_s is None else asked_s) * NS_PER_S)
+    return FreshnessLimits(**ages_ns)
 
 
 def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
@@ -211,15 +219,5 @@ def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
 
     For simulated flights only, which measure the effect of an age on a policy.
     """
-
-    def either_s(asked_s: float | None, own_s: float) -> float:
-        return own_s if asked_s is None else asked_s
-
-    return replace(
-        contract,
-        max_state_age_s=either_s(limits.max_attitude_age, contract.max_state_age_s),
-        max_velocity_age_s=either_s(limits.max_velocity_age, contract.max_velocity_age_s),
-        max_feature_age_s=either_s(limits.max_feature_age, contract.max_feature_age_s),
-        max_chunk_age_s=either_s(limits.max_chunk_age, contract.max_chunk_age_s),
-        max_stall_s=either_s(limits.max_stall, contract.max_stall_s),
-    )
+    asked_s = {own: getattr(limits, flag) for own, flag in _AGES.values()}
+    return replace(contract, **{own: s for own, s in asked_s.items() if s is not None})

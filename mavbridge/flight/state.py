@@ -6,8 +6,8 @@ Where an input is missing or stale, the result is the ``Reason`` instead.
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,13 +15,11 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.feature_cache import FeatureCache
-from policy.contract import Contract
-from policy.motion.rotation import other_frame
+from mavbridge.flight.plan import FlightPlan
+from policy.contract import QUATERNION, VELOCITY, Contract
+from policy.motion.rotation import motion_since_exposure, other_frame, slerp
 
-StateFrame = Literal["ned_frd", "enu_flu"]
-Ned = tuple[float, float, float]
 _READINGS = {"goal": "position", "altitude": "position", "height": "height above home"}
 
 LEAST_RATE_RADPS = 1e-4
@@ -33,47 +31,9 @@ Join: TypeAlias = Callable[[Sequence[Sequence[FloatArray]]], FloatArray]
 
 MAX_STATES = 4096
 """Past states kept: ten seconds of the fastest attitude stream."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Freshness:
-    """Maximum age of each kind of reading."""
-
-    attitude_ns: int
-    """Attitude and body rates."""
-    velocity_ns: int
-    """Velocity and specific force."""
-
-
-def build_state(
-    telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
-) -> VehicleState | Reason:
-    """Join the newest readings into a state in ``frame``, the contract's.
-
-    A missing or stale reading is a reason, never a zero.
-    """
-    attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
-    velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
-    if attitude is None or not attitude.is_fresh(now_ns, freshness.attitude_ns):
-        return stale(attitude, "attitude", now_ns, freshness.attitude_ns)
-    if rate is None or not rate.is_fresh(now_ns, freshness.attitude_ns):
-        return stale(rate, "body rate", now_ns, freshness.attitude_ns)
-    if velocity is None or not velocity.is_fresh(now_ns, freshness.velocity_ns):
-        return stale(velocity, "velocity", now_ns, freshness.velocity_ns)
-    if force is None or not force.is_fresh(now_ns, freshness.velocity_ns):
-        return stale(force, "acceleration", now_ns, freshness.velocity_ns)
-    row = (*velocity.values, *attitude.values, *rate.values, *force.values)
-    if frame == "enu_flu":
-        row = other_frame(row)
-    values = np.array((*row[:3], *_unit_positive(row[3:7]), *row[7:]), dtype=np.float32)
-    values.setflags(write=False)
-    return VehicleState(
-        values=values,
-        attitude_ns=attitude.happened_ns,
-        rate_ns=rate.happened_ns,
-        velocity_ns=velocity.happened_ns,
-        specific_force_ns=force.happened_ns,
-    )
+SPARSE_NS = 50 * NS_PER_MS
+"""At longer chunk periods the states of the chunks are too sparse for the motion since an
+exposure."""
 
 
 class FrozenStateCheck:
@@ -103,28 +63,53 @@ class FrozenStateCheck:
 
 
 class StateReader:
-    """Builds the states of one flight, with the optional inputs of its contract.
+    """Builds the states of one flight from telemetry.
 
     Optional inputs have the freshness limit of the velocity; a missing or stale one makes the state
     unavailable.
     """
 
-    def __init__(
-        self, contract: Contract, *, freshness: Freshness, goal_ned_m: Ned | None = None
-    ) -> None:
-        """``goal_ned_m``: goal relative to the estimator's origin, for a contract that asks for
-        one."""
-        self._frame = contract.state_frame
-        self._extras = contract.state_extras
-        self._freshness = freshness
-        self._goal_ned_m = goal_ned_m
+    def __init__(self, plan: FlightPlan) -> None:
+        self._frame = plan.contract.state_frame
+        self._extras = plan.contract.state_extras
+        self._limits = plan.start_limits
+        self._goal_ned_m = plan.config.goal_ned_m
+
+    def motion(self, telemetry: Telemetry, now_ns: int) -> VehicleState | Reason:
+        """Join the newest readings into a state without optional inputs.
+
+        A missing or stale reading is a reason, never a zero.
+        """
+        attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
+        velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
+        attitude_limit_ns, velocity_limit_ns = self._limits.state_ns, self._limits.velocity_ns
+        if attitude is None or not attitude.is_fresh(now_ns, attitude_limit_ns):
+            return stale(attitude, "attitude", now_ns, attitude_limit_ns)
+        if rate is None or not rate.is_fresh(now_ns, attitude_limit_ns):
+            return stale(rate, "body rate", now_ns, attitude_limit_ns)
+        if velocity is None or not velocity.is_fresh(now_ns, velocity_limit_ns):
+            return stale(velocity, "velocity", now_ns, velocity_limit_ns)
+        if force is None or not force.is_fresh(now_ns, velocity_limit_ns):
+            return stale(force, "acceleration", now_ns, velocity_limit_ns)
+        row = (*velocity.values, *attitude.values, *rate.values, *force.values)
+        if self._frame == "enu_flu":
+            row = other_frame(row)
+        values = np.array((*row[:3], *_unit_positive(row[3:7]), *row[7:]), dtype=np.float32)
+        values.setflags(write=False)
+        return VehicleState(
+            values=values,
+            attitude_ns=attitude.happened_ns,
+            rate_ns=rate.happened_ns,
+            velocity_ns=velocity.happened_ns,
+            specific_force_ns=force.happened_ns,
+        )
 
     def read(
         self, telemetry: Telemetry, now_ns: int, *, has_position: bool
     ) -> VehicleState | Reason:
         """Return the state at ``now_ns``. ``has_position``: the vehicle's position may be
         trusted."""
-        state = build_state(telemetry, now_ns, frame=self._frame, freshness=self._freshness)
+        state = self.motion(telemetry, now_ns)
         if isinstance(state, Reason) or not self._extras:
             return state
         position = telemetry.position_ned_m if has_position else None
@@ -132,7 +117,7 @@ class StateReader:
         stamps_ns: list[int] = []
         for extra in self._extras:
             reading = telemetry.height_above_home_m if extra == "height" else position
-            if reading is None or not reading.is_fresh(now_ns, self._freshness.velocity_ns):
+            if reading is None or not reading.is_fresh(now_ns, self._limits.velocity_ns):
                 return self._missing(extra, reading, now_ns)
             stamps_ns.append(reading.happened_ns)
             if extra == "goal":
@@ -153,7 +138,7 @@ class StateReader:
         what = _READINGS[extra]
         if reading is None:
             return because(Code.NO_TRUSTED_READING, quantity=what)
-        return stale(reading, what, now_ns, self._freshness.velocity_ns)
+        return stale(reading, what, now_ns, self._limits.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
         """Return the vector from the vehicle to the goal, in the contract's world frame."""
@@ -194,8 +179,8 @@ class Observation(NamedTuple):
     """States, shape [1, *contract.state_shape]."""
     state: VehicleState
     """Newest state."""
-    feature: FeatureFrame
-    """Newest feature of the first camera."""
+    captured_ns: int
+    """Exposure of the first camera's newest image."""
     image_ns: int
     """Oldest exposure among the newest images of all cameras."""
     frame_ids: tuple[tuple[int, ...], ...]
@@ -210,13 +195,7 @@ class ObservationSource:
     """
 
     def __init__(
-        self,
-        contract: Contract,
-        *,
-        caches: Sequence[FeatureCache],
-        join: Join,
-        max_feature_age_ns: int,
-        states_span_ns: int = 0,
+        self, contract: Contract, *, caches: Sequence[FeatureCache], join: Join, max_age_ns: int
     ) -> None:
         """Create an empty source.
 
@@ -224,36 +203,34 @@ class ObservationSource:
             contract: number and kind of observations.
             caches: one per camera, in the contract's order.
             join: ``PolicyRunner.join``.
-            max_feature_age_ns: oldest image to act on.
-            states_span_ns: how far before the newest attitude states are kept.
+            max_age_ns: oldest image to act on.
         """
         self._cameras = contract.cameras
         self._caches = tuple(caches)
         self._join = join
-        self._states: deque[VehicleState] = deque(maxlen=MAX_STATES)
-        self._span_ns = states_span_ns
-        self._max_feature_age_ns = max_feature_age_ns
+        self._max_age_ns = max_age_ns
+        self._has_motion = contract.since_exposure
         self._before_ns = observation_ages_ns(contract)
-        self._ego_motion: EgoMotion | None = None
-        if contract.since_exposure:
-            span_ns = max_feature_age_ns + self._before_ns[0]
-            self._ego_motion = EgoMotion(span_ns=span_ns)
-
-    def remember(self, state: VehicleState) -> None:
-        """Add a past state that arrived since the last solve; call in order."""
-        states = self._states
-        if states and state.attitude_ns <= states[-1].attitude_ns:
-            return
-        states.append(state)
-        while len(states) > 1 and states[1].attitude_ns <= state.attitude_ns - self._span_ns:
-            states.popleft()
-        if self._ego_motion is not None:
-            self._ego_motion.push(state)
+        self._span_ns = self._before_ns[0] + (max_age_ns if contract.since_exposure else 0)
+        self._states: deque[VehicleState] = deque(maxlen=MAX_STATES)
 
     def push(self, state: VehicleState) -> None:
-        """Add the newest state, also if no chunk is computed from it; call in order."""
-        if self._ego_motion is not None:
-            self._ego_motion.push(state)
+        """Add a state, also if no chunk is computed from it; call in order."""
+        states = self._states
+        attitude_ns, velocity_ns = state.attitude_ns, state.velocity_ns
+        if (
+            states
+            and attitude_ns <= states[-1].attitude_ns
+            and velocity_ns <= states[-1].velocity_ns
+        ):
+            return
+        states.append(state)
+        # One state from before the span stays: an exposure lies between two.
+        while len(states) > 1 and (
+            states[1].attitude_ns <= attitude_ns - self._span_ns
+            and states[1].velocity_ns <= velocity_ns - self._span_ns
+        ):
+            states.popleft()
 
     def observe(self, state: VehicleState, now_ns: int) -> Observation | Reason:
         """Return the inputs of a chunk from ``state``, the newest pushed, or why one is missing."""
@@ -262,9 +239,9 @@ class ObservationSource:
             feature = cache.latest()
             if feature is None:
                 return self._missing(camera, because(Code.NO_IMAGE))
-            if now_ns - feature.captured_ns > self._max_feature_age_ns:
+            if now_ns - feature.captured_ns > self._max_age_ns:
                 age_ms = (now_ns - feature.captured_ns) / NS_PER_MS
-                limit_ms = self._max_feature_age_ns / NS_PER_MS
+                limit_ms = self._max_age_ns / NS_PER_MS
                 old = because(Code.TOO_OLD, quantity="image", age_ms=age_ms, limit_ms=limit_ms)
                 return self._missing(camera, old)
             if feature.fault is not None:
@@ -281,7 +258,7 @@ class ObservationSource:
             encoded=self._join([[feature.value for feature in row] for row in rows]),
             states=self._rows(state, [row[0] for row in rows]),
             state=state,
-            feature=newest[0],
+            captured_ns=newest[0].captured_ns,
             image_ns=min(feature.captured_ns for feature in newest),
             frame_ids=tuple(tuple(feature.frame_id for feature in row) for row in rows),
         )
@@ -300,12 +277,12 @@ class ObservationSource:
 
     def _with_motion(self, state: VehicleState, feature: FeatureFrame) -> FloatArray:
         """Return the state with its optional inputs, [1, state_dim]."""
-        row = state.values[None]
-        if self._ego_motion is not None:
-            row = self._ego_motion.append_to(state, feature.captured_ns)
+        parts = [state.values]
+        if self._has_motion:
+            parts.append(motion_since(feature.captured_ns, state, self._states))
         if state.extras:
-            row = np.append(row, np.array([state.extras], np.float32), axis=1)
-        return row
+            parts.append(np.array(state.extras, np.float32))
+        return np.concatenate(parts)[None]
 
     def _missing(self, camera: int, why: Reason) -> Reason:
         """Of several cameras, name the one."""
@@ -321,5 +298,49 @@ def observation_ages_ns(contract: Contract) -> tuple[int, ...]:
     return tuple(step_ns * steps for steps in reversed(range(contract.observation_steps)))
 
 
+def keeps_past(plan: FlightPlan) -> bool:
+    """True if the states between two solves are needed.
+
+    They are for past observations; and for the motion since an exposure if the states of the solves
+    are too sparse.
+    """
+    is_sparse = plan.guard.chunk_period_ns > SPARSE_NS
+    return plan.contract.observation_steps > 1 or (plan.contract.since_exposure and is_sparse)
+
+
 def _nearest(states: Sequence[VehicleState], at_ns: int) -> VehicleState:
     return min(states, key=lambda state: abs(state.attitude_ns - at_ns))
+
+
+def motion_since(exposed_ns: int, state: VehicleState, known: Sequence[VehicleState]) -> FloatArray:
+    """Return ``contract.SINCE_EXPOSURE_NAMES`` [7] of a state, in its frame.
+
+    Args:
+        exposed_ns: exposure of the image. If it is after the attitude, the motion is zero and the
+            age negative.
+        state: state to which the motion leads.
+        known: states in order, at least one.
+    """
+    before, after, share = _around([s.attitude_ns for s in known], exposed_ns)
+    one, other = (tuple(known[k].values[QUATERNION].tolist()) for k in (before, after))
+    attitude_then = slerp(one, other, share)
+    before, after, share = _around([s.velocity_ns for s in known], exposed_ns)
+    one, other = (tuple(known[k].values[VELOCITY].tolist()) for k in (before, after))
+    ux, uy, uz = (p + share * (q - p) for p, q in zip(one, other, strict=True))
+    vx, vy, vz = state.values[VELOCITY].tolist()
+    attitude_now = tuple(state.values[QUATERNION].tolist())
+    turn, change = motion_since_exposure(attitude_then, attitude_now, (vx - ux, vy - uy, vz - uz))
+    age_s = (state.attitude_ns - exposed_ns) / NS_PER_S
+    return np.array((age_s, *turn, *change), np.float32)
+
+
+def _around(stamps_ns: Sequence[int], at_ns: int) -> tuple[int, int, float]:
+    """Return the indices before and after a time, and its position between them, 0 to 1."""
+    after = len(stamps_ns) - 1
+    for before in range(after, -1, -1):  # from the newest: an image is a few states old
+        if stamps_ns[before] <= at_ns:
+            between_ns = stamps_ns[after] - stamps_ns[before]
+            share = (at_ns - stamps_ns[before]) / between_ns if between_ns else 0.0
+            return before, after, share
+        after = before
+    return after, after, 0.0

@@ -6,15 +6,16 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
 from itertools import groupby
-from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Position, Tick, VehicleState
+from mavbridge.core.records import Position, Solve, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import Freshness, StateFrame, build_state
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.state import StateReader, keeps_past
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
@@ -39,17 +40,6 @@ MAX_SOLVES = 256
 """Chunks whose inputs are kept until the guard reports that it has flown them."""
 
 
-class SolveInputs(NamedTuple):
-    """Inputs and duration of one solve."""
-
-    serial: int
-    state: VehicleState
-    feature_frame_id: int
-    feature_captured_ns: int
-    computed_ns: int
-    predict_ns: int
-
-
 class TelemetryCache:
     """Telemetry, sent actions and phase; turns the guard's reports into ticks.
 
@@ -59,36 +49,35 @@ class TelemetryCache:
 
     def __init__(
         self,
+        plan: FlightPlan,
         *,
-        history: SentHistory,
         sink: TickSink,
-        state_frame: StateFrame,
-        freshness: Freshness,
         samples: SocketPort | None = None,
-        keeps_past: bool = False,
         watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
     ) -> None:
         """Start without a vehicle.
 
         Args:
-            history: takes every stick that was sent.
+            plan: tells the frame, the age limits and the history of states and actions.
             sink: takes a tick for every send, and for every slot without one.
-            state_frame: frame of the states in ticks in which the policy does not fly.
-            freshness: oldest readings that such a state may have.
             samples: where the vehicle's readings come from, if not by ``receive``: the thread that
                 waits for an attitude reads them itself, so that no other one has to wake it.
-            keeps_past: keep the telemetry at each attitude for ``take_past``.
             watch_packets: is given packets for a recorder, in the same thread; must not block.
         """
-        self._history = history
+        contract = plan.contract
+        self.history = SentHistory(
+            length=contract.history_len, dt_s=contract.history_dt_s, frame=action_frame(contract)
+        )
+        """Every action that was sent."""
+        self.reader = StateReader(plan)
         self._sink = sink
-        self._state_frame = state_frame
-        self._freshness = freshness
         self._watch_packets = watch_packets
         self.telemetry = Telemetry()
         """Newest reading of each quantity."""
-        self._past: deque[Telemetry] | None = deque(maxlen=MAX_PAST) if keeps_past else None
-        self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
+        self._past: deque[Telemetry] | None = deque(maxlen=MAX_PAST) if keeps_past(plan) else None
+        """Telemetry at each attitude since the last solve."""
+        self._solves: OrderedDict[int, tuple[Solve, int]] = OrderedDict()
+        """By serial number of the chunk: the solve, and the exposure of its image."""
         self._samples = samples
         self._lock = threading.Lock()
         """Held while samples are read."""
@@ -149,9 +138,9 @@ class TelemetryCache:
         finally:
             self._is_awaited = False
 
-    def remember(self, solve: SolveInputs) -> None:
-        """Keep the inputs of a chunk for the ticks that will be flown by it."""
-        self._solves[solve.serial] = solve
+    def remember(self, solve: Solve, captured_ns: int) -> None:
+        """Keep a solve, and the exposure of its image, for the ticks that will fly its chunk."""
+        self._solves[solve.serial] = solve, captured_ns
         if len(self._solves) > MAX_SOLVES:
             self._solves.popitem(last=False)
 
@@ -199,37 +188,32 @@ class TelemetryCache:
             self.flights += 1
         self.phase, self.reason = tick.phase, tick.reason
         self.starting_ns = tick.starting_ns
-        self._history.append(tick.sent, tick.sent_ns)
+        self.history.append(tick.sent, tick.sent_ns)
         self._sink.emit(self._join(tick))
         self._was_flown = tick.trace is not None
         self._serial += 1
 
-    def _state_at(self, now_ns: int) -> VehicleState | None:
-        state = build_state(
-            self.telemetry, now_ns, frame=self._state_frame, freshness=self._freshness
-        )
-        return state if isinstance(state, VehicleState) else None
-
     def _join(self, sent: GuardTick) -> Tick:
         """Join the guard's report with the inputs of the chunk that was flown."""
-        solve = None if sent.chunk_serial is None else self._solves.get(sent.chunk_serial)
-        state = solve.state if solve else self._state_at(sent.sent_ns)
+        no_solve: tuple[Solve | None, int | None] = None, None
+        solve, captured_ns = self._solves.get(sent.chunk_serial or 0, no_solve)
+        state = solve.state if solve else self.reader.motion(self.telemetry, sent.sent_ns)
         position = self.telemetry.position_ned_m
         is_placed = position is not None and sent.sent_ns - position.arrived_ns <= POSITION_NS
         texts = self.take_texts()
         is_flown = sent.phase is Phase.FLYING
         return Tick(
             serial=self._serial,
-            index=sent.index,
+            index=-1 if sent.slot is None else sent.slot,
             due_ns=sent.due_ns,
             woke_ns=sent.woke_ns,
             decided_ns=sent.decided_ns,
             missed_slots=sent.missed_slots if self._was_flown and sent.trace else 0,
-            predict_ns=solve.predict_ns if solve else None,
+            predict_ns=solve.computed_ns - solve.started_ns if solve else None,
             sent_ns=sent.sent_ns,
-            feature_frame_id=solve.feature_frame_id if solve else None,
-            feature_captured_ns=solve.feature_captured_ns if solve else None,
-            state=state,
+            feature_frame_id=solve.frame_ids[-1][0] if solve else None,
+            feature_captured_ns=captured_ns,
+            state=state if isinstance(state, VehicleState) else None,
             trace=sent.trace,
             sent=sent.sent,
             release_reason=None if is_flown else sent.reason,
@@ -238,7 +222,7 @@ class TelemetryCache:
             rc_channels_us=self.status.rc_channels_us,
             rc_sticks=self.status.rc_sticks,
             texts=texts,
-            is_slot=sent.is_slot,
+            is_slot=sent.slot is not None,
             chunk_serial=sent.chunk_serial,
             is_coasting=sent.is_coasting,
             phase=sent.phase.value,

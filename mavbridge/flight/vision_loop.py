@@ -27,11 +27,11 @@ class VisionLoop:
         self,
         *,
         camera: Camera,
-        encode: Callable[[CameraImage], FloatArray],
+        encode: Callable[[CameraImage, int], FloatArray],
         cache: FeatureCache,
         sink: TickSink,
         clock: Clock,
-        period_ns: Callable[[], int],
+        period_ns: int,
         encoder_lock: threading.Lock,
         image_watch: ImageWatch | None = None,
         is_airborne: Callable[[], bool] = lambda: False,
@@ -41,11 +41,11 @@ class VisionLoop:
 
         Args:
             camera: read by this loop alone.
-            encode: image to feature.
+            encode: image of a camera to its feature.
             cache: gets every feature; one whose image is at fault says so.
             sink: gets a tick for every feature.
             clock: time of the start and end of the encoding.
-            period_ns: shortest time between two encoded frames, asked for each of them.
+            period_ns: shortest time between two encoded frames.
             encoder_lock: held while encoding; loops that share a policy share it, because no
                 policy has to be ready for two threads.
             image_watch: judges each encoded frame; None where the policy looks at no image, or the
@@ -99,7 +99,7 @@ class VisionLoop:
             fault = because(Code.IMAGE_AHEAD, ahead_ms=ahead_ms, limit_ms=limit_ms)
         with self._encoder_lock:
             self.encoding_since_ns = self._clock.now_ns()
-            value = self._encode(frame.rgb)
+            value = self._encode(frame.rgb, self._number)
             self.encoding_since_ns = None
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
@@ -131,10 +131,9 @@ class VisionLoop:
         if self._used_ns is None:
             self._used_ns = captured_ns
             return True
-        period_ns = self._period_ns()
-        due_ns = self._used_ns + period_ns
-        if captured_ns < due_ns - period_ns // 4:
+        due_ns = self._used_ns + self._period_ns
+        if captured_ns < due_ns - self._period_ns // 4:
             return False
         # Keep the grid through jitter; after a gap start a new one.
-        self._used_ns = max(due_ns, captured_ns - period_ns // 2)
+        self._used_ns = max(due_ns, captured_ns - self._period_ns // 2)
         return True

@@ -99,7 +99,7 @@ def _fly(
     loop = GuardLoop(clock, link, port, samples=samples, received=received, lead_ns=LEAD_NS)
     told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
-    refusal = settle_guard(realtime=settings.realtime, cpu=settings.cpu)
+    refusal = settle_guard(realtime=settings.realtime)
     if refusal is not None:
         port.send(encode_from_guard(GuardMessage(refusal)))
     try:

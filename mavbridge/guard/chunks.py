@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -45,13 +45,8 @@ class FreshnessLimits:
 
     def while_played(self, play_ns: int) -> "FreshnessLimits":
         """Return the limits at the time of sending, for chunks played for ``play_ns``."""
-        return FreshnessLimits(
-            state_ns=self.state_ns + play_ns,
-            velocity_ns=self.velocity_ns + play_ns,
-            feature_ns=self.feature_ns + play_ns,
-            chunk_ns=self.chunk_ns + play_ns,
-            stall_ns=self.stall_ns,
-        )
+        played = ("state_ns", "velocity_ns", "feature_ns", "chunk_ns")
+        return replace(self, **{name: getattr(self, name) + play_ns for name in played})
 
 
 class Chunk(NamedTuple):
@@ -97,39 +92,38 @@ class Chunk(NamedTuple):
         return type(first)(*[(1.0 - weight) * a + weight * b for a, b in pairs])
 
 
-_Input: TypeAlias = Literal["attitude", "velocity", "image", "chunk", "horizon"]
+_Input: TypeAlias = Literal["attitude", "velocity", "image", "chunk"]
 Place: TypeAlias = Literal["computer", "guard", "flight process", "solve", "link", "camera"]
 
 
-class Lateness(NamedTuple):
-    """Input that became too old to fly on, and the place where the time was lost."""
+def late(
+    name: _Input | Literal["horizon"],
+    age_ns: int,
+    limit_ns: int,
+    place: Place,
+    spent_ns: int,
+    said: Reason | None = None,
+) -> Reason:
+    """Return the reason to end a flight because an input is too old.
 
-    name: _Input
-    """chunk: none arrived within the grace. horizon: the last chunk ended first."""
-    age_ns: int
-    limit_ns: int
-    place: Place
-    stall_ns: int
-    """Time lost at ``place``."""
-    said: Reason | None = None
-    """Why the flight process computed no chunk; None: it gave no reason."""
-
-    @property
-    def reason(self) -> Reason:
-        """The lateness as a reason to end a flight."""
-        code, quantity = Code.LATE, str(self.name)
-        if self.name == "horizon":
-            code, quantity = Code.PAST_HORIZON, "chunk"
-        reason = because(
-            code,
-            quantity=quantity,
-            age_ms=self.age_ns / NS_PER_MS,
-            limit_ms=self.limit_ns / NS_PER_MS,
-            place=self.place,
-            spent_ms=self.stall_ns / NS_PER_MS,
-        )
-        said: tuple[tuple[str, Reason], ...] = () if self.said is None else (("said", self.said),)
-        return Reason(code, (*reason.data, *said))
+    Args:
+        name: chunk: none arrived within the grace. horizon: the last chunk ended first.
+        age_ns: age of the input.
+        limit_ns: its limit.
+        place: where the time was lost.
+        spent_ns: time lost there.
+        said: why the flight process computed no chunk; None: it gave no reason.
+    """
+    is_horizon = name == "horizon"
+    reason = because(
+        Code.PAST_HORIZON if is_horizon else Code.LATE,
+        quantity="chunk" if is_horizon else name,
+        age_ms=age_ns / NS_PER_MS,
+        limit_ms=limit_ns / NS_PER_MS,
+        place=place,
+        spent_ms=spent_ns / NS_PER_MS,
+    )
+    return reason if said is None else Reason(reason.code, (*reason.data, ("said", said)))
 
 
 class ChunkBuffer:
@@ -277,29 +271,35 @@ class ChunkBuffer:
         """Return why the flight must end now, or None: grace over, or malformed chunks."""
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
-        late = self.lateness(now_ns)
-        return None if late is None else late.reason
+        return self.lateness(now_ns)
 
     def is_over(self, now_ns: int) -> bool:
         """True if the grace, or the allowed stall, has ended."""
         return self.newest is None or now_ns > self._until_ns
 
     def lateness(
-        self, now_ns: int, *, stood_ns: int = 0, heard_ns: Mapping[str, int] | None = None
-    ) -> Lateness | None:
-        """Return the input whose age ended the grace, or None during the grace.
+        self,
+        now_ns: int,
+        *,
+        stood_ns: int = 0,
+        heard_ns: Mapping[str, int] | None = None,
+        arriving: Chunk | None = None,
+    ) -> Reason | None:
+        """Return the reason with the input whose age ended the grace, or None during the grace.
 
         Args:
             now_ns: current time.
             stood_ns: duration of the guard's stall until now.
             heard_ns: arrival of the vehicle's newest "attitude" and "velocity", by these names.
+            arriving: chunk that has just arrived.
         """
         if not self.is_over(now_ns):
             return None
         said = None if self._is_stale else self._refusal
         silent_ns = now_ns - self._word_ns
         if self._seen is None:
-            return Lateness("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
+            return late("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
+        name: _Input | Literal["horizon"]
         name, happened_ns, limit_ns = min(self._ages(self._seen), key=lambda age: age[1] + age[2])
         is_stall = self._until_ns > self._grace_until_ns  # ages may exceed their limits then
         if is_stall or now_ns <= happened_ns + limit_ns:
@@ -314,8 +314,11 @@ class ChunkBuffer:
         }
         place = max(spent, key=lambda each: spent[each])
         if 2 * stood_ns >= spent[place]:
-            place, spent["computer"] = "computer", stood_ns
-        return Lateness(name, now_ns - happened_ns, limit_ns, place, spent[place], said)
+            # A chunk computed in the second half of the stall shows that only the guard stalled.
+            was_solving = arriving is not None and arriving.computed_ns > now_ns - stood_ns // 2
+            place = "guard" if was_solving else "computer"
+            spent[place] = stood_ns
+        return late(name, now_ns - happened_ns, limit_ns, place, spent[place], said)
 
     def _malformed_lately(self, now_ns: int) -> Reason | None:
         window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, EngagementSettings, Memory, not_engaged
+from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, Memory, not_engaged
 from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
 from mavbridge.guard.table import PROGRESS, TABLE, Transition, ended, objection
 from mavbridge.guard.values import (
@@ -14,6 +14,7 @@ from mavbridge.guard.values import (
     ControlSource,
     EndRequest,
     EngagementInputs,
+    EngagementSettings,
     OperatorCommand,
     Phase,
 )
@@ -39,8 +40,8 @@ class Engagement(Memory):
         super().__init__(
             settings=settings,
             first_chunk_ns=ACT_TIMEOUT_NS + 2 * chunk_period_ns,
-            engage=EngageSequence(settings.engage),
-            disengage=DisengageSequence(settings.disengage),
+            engage=EngageSequence(settings),
+            disengage=DisengageSequence(settings),
             wants_arm=settings.arm,
         )
 
@@ -55,8 +56,8 @@ class Engagement(Memory):
             return self._watch(now)
         self._listen(now)
         self._note_act(now, act)
-        if self.phase is Phase.FLYING and now.is_landed is not None:
-            has_left = self.outcome.has_left_ground or not now.is_landed
+        if self.phase is Phase.FLYING and now.status.is_landed is not None:
+            has_left = self.outcome.has_left_ground or not now.status.is_landed
             self.outcome = self.outcome._replace(has_left_ground=has_left)
         while True:
             if self.phase is Phase.PREPARING:
@@ -89,18 +90,18 @@ class Engagement(Memory):
             case Phase.FLYING:
                 return Actions(control=ControlSource.POLICY)
             case Phase.LEAVING | Phase.HOLDING:
-                if now.mode == self.disengage.mode:
-                    self.own_mode = now.mode
+                if now.status.mode == self.disengage.mode:
+                    self.own_mode = now.status.mode
                 return self.disengage.step(now, self.unheard_ns)
             case Phase.RELEASING:
                 self.owes_release = False
                 return Actions(control=ControlSource.RELEASE)
             case Phase.WAITING:
-                self.reason = now.link_problem or now.chunk_problem or because(Code.NOT_ENGAGED)
+                self.reason = now.link.problem or now.chunk_problem or because(Code.NOT_ENGAGED)
         return Actions()
 
     def _prepare(self, now: EngagementInputs) -> Actions:
-        self.was_armed = now.armed
+        self.was_armed = now.status.armed
         # During the policy's reset, its silence must not restart the reset.
         chunk_problem = now.chunk_problem if self.starting_ns is None else None
         actions = self.engage.step(now, objection(self, now) or chunk_problem)
@@ -140,7 +141,7 @@ class Engagement(Memory):
         """Update whether the reported mode is current."""
         now_ns, stepped_ns = now.now_ns, self.stepped_ns
         heard_ns = now_ns if now.heard_ns is None else now.heard_ns
-        mode_ns = now_ns if now.mode_ns is None else now.mode_ns
+        mode_ns = now_ns if now.status.mode_arrived_ns is None else now.status.mode_arrived_ns
         self.stepped_ns = now_ns
         stood_still = stepped_ns is not None and now_ns - stepped_ns > SILENCE_NS
         if stood_still or now_ns - heard_ns > SILENCE_NS:
@@ -156,13 +157,13 @@ class Engagement(Memory):
         """Treat the present mode as ours if we wait for no other, or requested it."""
         is_first = self.own_mode is None and self.engage.wanted_mode(now) is None
         if is_first or self.engage.is_own_mode(now):
-            self.own_mode = now.mode
+            self.own_mode = now.status.mode
 
     def _note_act(self, now: EngagementInputs, act: OperatorCommand | None) -> None:
         """Note this step's act: the operator's command, the engage switch or the first arming."""
-        is_first_arming = now.armed and self.is_arming_awaited is True
-        if now.is_connected and self.is_arming_awaited is not False:
-            self.is_arming_awaited = not now.armed
+        is_first_arming = now.status.armed and self.is_arming_awaited is True
+        if now.link.status is not None and self.is_arming_awaited is not False:
+            self.is_arming_awaited = not now.status.armed
         is_act = self._is_switched_on(now) or (is_first_arming and self.settings.engage_on_arm)
         self.act = act or ("engage" if is_act else None)
 
@@ -173,12 +174,14 @@ class Engagement(Memory):
         healthy receiver.
         """
         channel = self.settings.engage_channel
-        if channel is None or len(now.rc_channels_us) < channel:
+        if channel is None or len(now.status.rc_channels_us) < channel:
             return False
-        arrived_ns = now.now_ns if now.channels_ns is None else now.channels_ns
+        arrived_ns = (
+            now.now_ns if now.status.channels_arrived_ns is None else now.status.channels_arrived_ns
+        )
         was_off = self.switch.is_off
-        is_act = self.switch.read(now.rc_channels_us[channel - 1], arrived_ns)
-        if now.is_failsafe or now.is_receiver_sick:
+        is_act = self.switch.read(now.status.rc_channels_us[channel - 1], arrived_ns)
+        if now.status.is_failsafe or now.status.is_receiver_sick:
             self.switch.forget()
             is_act = False
         if was_off and not self.switch.is_off and not is_act:
@@ -199,8 +202,10 @@ class Engagement(Memory):
         if self.phase in (Phase.PREPARING, Phase.FLYING):
             twin.stop(EndRequest(because(Code.GUARD_DIED), is_fault=True))
         # Sticks jump to neutral unseen; the flight process sends the words at once, or never.
-        now = replace(now, are_sticks_at_rest=False, heard_ns=None, mode_ns=None)
-        rest_ns = STICK_REST_NS if now.modes.override else 0
+        link = replace(now.link, are_sticks_at_rest=False)
+        status = replace(now.status, mode_arrived_ns=None)
+        now = replace(now, link=link, status=status, heard_ns=None)
+        rest_ns = STICK_REST_NS if now.link.modes.override else 0
         until_ns = rest_ns + _ASKED_NS
         for after_ns in (after_ms * NS_PER_MS for after_ms in _REHEARSED_MS):
             if after_ns > until_ns:

@@ -1,22 +1,29 @@
 """Flight envelope: tilt, height, speed, distance, estimator, battery, landing."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import Telemetry, VehicleStatus
 
-READING_PERSIST_NS = 50 * NS_PER_MS
+READING_NS = 50 * NS_PER_MS
 """Debounce time of tilt and speed, by the readings' timestamps: six readings at 100 Hz, two at 20
 Hz or less, so that one bad reading does not end a flight."""
-POSITION_PERSIST_NS = 300 * NS_PER_MS
+POSITION_NS = 300 * NS_PER_MS
 """Debounce time of height and distance; 6 m at the default speed limit."""
-FLAG_PERSIST_NS = 600 * NS_PER_MS
+FLAG_NS = 600 * NS_PER_MS
 """Debounce time of estimator, battery and landing: more than one message at 2 Hz."""
 FRESH_NS = 500 * NS_PER_MS
 """Oldest attitude and velocity that are checked; the policy's inputs have stricter age limits."""
+_WATCHED = {
+    "tilt": ("deg", READING_NS, "no fresh attitude"),
+    "speed": ("m/s", READING_NS, "no valid velocity"),
+    "height": ("m", POSITION_NS, "no valid position"),
+    "distance": ("m", POSITION_NS, "no valid position"),
+}
+"""By quantity: unit, debounce time, and what is missing where it cannot be watched."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,19 +38,6 @@ class EnvelopeLimits:
     """Speed in three dimensions."""
     distance_m: float = 300.0
     """Horizontal, from the estimator's origin; about as far as a small vehicle is visible."""
-    estimator: bool = True
-    """Fault if the estimator loses a position that it had."""
-    battery: bool = True
-    landing: bool = True
-    """A landing ends the flight."""
-
-    def widened(self, by: "EnvelopeLimits") -> "EnvelopeLimits":
-        """Return the wider limit of each pair; a quantity unwatched in either is unwatched."""
-        wider: dict[str, float | bool] = {}
-        for field in fields(self):
-            one, other = getattr(self, field.name), getattr(by, field.name)
-            wider[field.name] = max(one, other) if one and other else type(one)(0)
-        return EnvelopeLimits(**wider)  # type: ignore[arg-type]
 
 
 class Envelope:
@@ -76,10 +70,34 @@ class Envelope:
         """
         self.unwatched.clear()
         self._found = None
-        self._check_motion(telemetry, now_ns)
-        self._check_position(status.position_ned_m, now_ns)
+        limits, position = self._limits, status.position_ned_m
+        attitude, velocity = telemetry.ned_from_body_wxyz, telemetry.velocity_ned_mps
+        if attitude is None or now_ns - attitude.arrived_ns > FRESH_NS:
+            self._watch("tilt", None, limits.tilt_deg, now_ns)
+        else:
+            tilt_deg = math.degrees(tilt_rad(attitude.values))
+            self._watch("tilt", tilt_deg, limits.tilt_deg, attitude.arrived_ns)
+        if velocity is None or now_ns - velocity.arrived_ns > FRESH_NS:
+            self._watch("speed", None, limits.speed_mps, now_ns)
+        else:
+            speed_mps = math.hypot(*velocity.values)
+            self._watch("speed", speed_mps, limits.speed_mps, velocity.arrived_ns)
+        distance_m = None if position is None else math.hypot(position[0], position[1])
+        self._watch("height", status.height_m, limits.height_m, now_ns)
+        self._watch("distance", distance_m, limits.distance_m, now_ns)
         self._check_flags(status, now_ns)
         return self._found
+
+    def _watch(self, name: str, value: float | None, limit: float, stamp_ns: int) -> None:
+        """Compare one quantity with its limit. ``value``: None without valid data."""
+        unit, persist_ns, lack = _WATCHED[name]
+        if not 0 < limit < math.inf:
+            return
+        if value is None:
+            self._ignore(name, lack)
+            return
+        problem = because(Code.BEYOND, quantity=name, value=value, limit=limit, unit=unit)
+        self._note(name, problem if value > limit else None, stamp_ns, persist_ns)
 
     def _note(self, name: str, problem: Reason | None, stamp_ns: int, persist_ns: int) -> None:
         """Note the state of one quantity; ``stamp_ns`` counts for its debounce time."""
@@ -95,65 +113,15 @@ class Envelope:
         self._since_ns.pop(name, None)
         self.unwatched.append(f"{name} is not watched: {reason}")
 
-    def _check_motion(self, telemetry: Telemetry, now_ns: int) -> None:
-        oldest_ns, limits = now_ns - FRESH_NS, self._limits
-        if _is_limit(limits.tilt_deg):
-            attitude = telemetry.ned_from_body_wxyz
-            if attitude is None or attitude.arrived_ns < oldest_ns:
-                self._ignore("tilt", "no fresh attitude")
-            else:
-                tilt_deg = math.degrees(tilt_rad(attitude.values))
-                problem = _beyond("tilt", tilt_deg, limits.tilt_deg, "deg")
-                self._note("tilt", problem, attitude.arrived_ns, READING_PERSIST_NS)
-        if _is_limit(limits.speed_mps):
-            velocity = telemetry.velocity_ned_mps
-            if velocity is None or velocity.arrived_ns < oldest_ns:
-                self._ignore("speed", "no valid velocity")
-            else:
-                speed_mps = math.hypot(*velocity.values)
-                problem = _beyond("speed", speed_mps, limits.speed_mps, "m/s")
-                self._note("speed", problem, velocity.arrived_ns, READING_PERSIST_NS)
-
-    def _check_position(
-        self, position_ned_m: tuple[float, float, float] | None, now_ns: int
-    ) -> None:
-        watched = (("height", self._limits.height_m), ("distance", self._limits.distance_m))
-        for name, limit_m in watched:
-            if not _is_limit(limit_m):
-                continue
-            if position_ned_m is None:
-                self._ignore(name, "no valid position")
-                continue
-            north_m, east_m, down_m = position_ned_m
-            value_m = -down_m if name == "height" else math.hypot(north_m, east_m)
-            problem = _beyond(name, value_m, limit_m, "m")
-            self._note(name, problem, now_ns, POSITION_PERSIST_NS)
-
     def _check_flags(self, status: VehicleStatus, now_ns: int) -> None:
-        limits = self._limits
-        if limits.estimator:
-            self._had_position |= status.is_position_valid is True
-            if not self._had_position or status.is_position_valid is None:
-                self._ignore("estimator", "it reports no valid position")
-            lost = self._had_position and status.is_position_valid is False
-            problem = because(Code.ESTIMATOR_LOST) if lost else None
-            self._note("estimator", problem, now_ns, FLAG_PERSIST_NS)
-        if limits.battery:
-            self._note("battery", status.battery_problem, now_ns, FLAG_PERSIST_NS)
-        if limits.landing:
-            if status.is_landed is None:
-                self._ignore("landing", "the vehicle does not say whether it is in the air")
-            self._was_in_air |= status.armed and status.is_landed is False
-            has_landed = self._was_in_air and status.armed and status.is_landed is True
-            problem = because(Code.LANDED) if has_landed else None
-            self._note("landing", problem, now_ns, FLAG_PERSIST_NS)
-
-
-def _is_limit(limit: float) -> bool:
-    return 0 < limit < math.inf
-
-
-def _beyond(name: str, value: float, limit: float, unit: str) -> Reason | None:
-    if value <= limit:
-        return None
-    return because(Code.BEYOND, quantity=name, value=value, limit=limit, unit=unit)
+        self._had_position |= status.is_position_valid is True
+        if not self._had_position or status.is_position_valid is None:
+            self._ignore("estimator", "it reports no valid position")
+        lost = self._had_position and status.is_position_valid is False
+        self._note("estimator", because(Code.ESTIMATOR_LOST) if lost else None, now_ns, FLAG_NS)
+        self._note("battery", status.battery_problem, now_ns, FLAG_NS)
+        if status.is_landed is None:
+            self._ignore("landing", "the vehicle does not say whether it is in the air")
+        self._was_in_air |= status.armed and status.is_landed is False
+        has_landed = self._was_in_air and status.armed and status.is_landed is True
+        self._note("landing", because(Code.LANDED) if has_landed else None, now_ns, FLAG_NS)

@@ -19,21 +19,23 @@ from mavbridge.core.vehicle import (
     Release,
     Sticks,
 )
-from mavbridge.guard.chunks import Chunk, ChunkBuffer, Lateness
+from mavbridge.guard.chunks import Chunk, ChunkBuffer, late
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import Envelope
 from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import (
+    NOT_FOUND,
+    Actions,
     ControlSource,
     EndRequest,
     EngagementInputs,
     OperatorCommand,
     Outcome,
     Phase,
-    Slot,
     StickGrid,
 )
+from mavbridge.guard.wire import GuardTick
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells the position of the pilot's sticks."""
@@ -61,25 +63,12 @@ class GuardOutput:
 
     decision: Decision | None
     """None: send nothing now."""
-    slot: Slot | None
-    """Slot of the stick grid that this step serves; None between slots."""
-    trace: ActionTrace | None
-    """Stages from the policy's action to ``decision``; None while the policy does not control."""
-    chunk_serial: int | None
-    is_coasting: bool
-    phase: Phase
-    reason: Reason | None
-    """Why the policy does not fly; None while it does."""
-    mode: str | None
-    """Flight mode to request."""
-    arm: bool
-    takeoff_m: float | None
-    """Height for an autonomous takeoff, to request."""
+    actions: Actions
+    """Requests to the vehicle."""
     messages: tuple[str, ...]
     """Texts for the user."""
-    starting_ns: int
-    """Time since which only the policy's first chunk is missing: it gets control with the first
-    chunk that follows a reset at or after this time; 0: not starting."""
+    tick: GuardTick
+    """Report of the step. The loop adds what was sent, and when it woke and sent."""
 
 
 class Guard:
@@ -163,22 +152,26 @@ class Guard:
         decision, trace = None, None
         if slot is not None or is_urgent:
             self._grid.serve(now_ns)
-            is_thrust = inputs.mode in inputs.modes.thrust
+            is_thrust = inputs.status.mode in given.link.modes.thrust
             decision, trace = self._decide(actions.control, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
-        return GuardOutput(
-            decision=decision,
-            slot=slot,
-            trace=trace,
-            chunk_serial=newest.serial if trace is not None and newest is not None else None,
+        tick = GuardTick(
+            slot=slot.index if slot else None,
+            due_ns=slot.due_ns if slot else now_ns,
+            woke_ns=now_ns,
+            decided_ns=now_ns,
+            sent_ns=now_ns,
+            missed_slots=slot.missed if slot else 0,
             is_coasting=trace is not None and self._chunks.is_coasting(now_ns),
+            chunk_serial=newest.serial if trace is not None and newest is not None else None,
+            trace=trace,
+            sent=None,
             phase=phase,
             reason=self._engagement.reason,
-            mode=actions.mode,
-            arm=actions.arm,
-            takeoff_m=actions.takeoff_m,
-            messages=self._take_messages(),
             starting_ns=self._engagement.starting_ns or 0,
+        )
+        return GuardOutput(
+            decision=decision, actions=actions, messages=self._take_messages(), tick=tick
         )
 
     def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
@@ -190,7 +183,7 @@ class Guard:
         if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= limit_ns:
             return None
         age_ns = now_ns - attitude.arrived_ns
-        return Lateness("attitude", age_ns, limit_ns, "link", age_ns).reason
+        return late("attitude", age_ns, limit_ns, "link", age_ns)
 
     def _overdue(self, now_ns: int, stood_ns: int, given: GuardInput) -> Reason | None:
         """Return the reason if an input of the policy's flight is too late, or None."""
@@ -201,7 +194,7 @@ class Guard:
             "attitude": (seen.ned_from_body_wxyz, seen.rate_body_radps),
             "velocity": (seen.velocity_ned_mps, seen.specific_force_body_mps2),
         }
-        late = self._chunks.lateness(
+        return self._chunks.lateness(
             now_ns,
             stood_ns=stood_ns,
             heard_ns={
@@ -209,18 +202,12 @@ class Guard:
                 for name, pair in readings.items()
                 if any(pair)
             },
+            arriving=given.chunk,
         )
-        if late is None:
-            return None
-        # A chunk computed in the second half of the stall shows that only the guard stalled.
-        middle_ns, chunk = now_ns - stood_ns // 2, given.chunk
-        if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
-            late = late._replace(place="guard")
-        return late.reason
 
     def _inputs(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> EngagementInputs:
-        link, left, chunk_fault = given.link, None, given.command_fault or overdue
-        status = link.status
+        link, status = given.link, given.link.status
+        chunk_fault = given.command_fault or overdue
         is_flying = self._engagement.phase is Phase.FLYING
         if chunk_fault is None and is_flying:
             chunk_fault = self._chunks.fault(now_ns)
@@ -229,40 +216,18 @@ class Guard:
         is_sought = not is_flying or self._engagement.settings.readonly
         starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns
+        left: Reason | None = None
         if status is not None:
             left = self._envelope.check(now_ns, link.telemetry, status)
         has_landed = left is not None and left.code is Code.LANDED
         return EngagementInputs(
             now_ns=now_ns,
-            is_connected=status is not None,
-            link_problem=link.problem,
-            interruption=link.interruption,
-            interruptions=link.interruptions,
-            overruled=link.problem if link.is_overruled else None,
-            is_switched_off=link.is_switched_off,
-            mode=status.mode if status else "unknown",
-            modes=link.modes,
-            armed=status is not None and status.armed,
-            is_failsafe=status is not None and status.is_failsafe,
-            has_receiver=status.has_receiver if status else None,
-            pilot_sticks=status.pilot_sticks if status else None,
-            rc_channels_us=status.rc_channels_us if status else (),
+            link=link,
+            status=status or NOT_FOUND,
             heard_ns=_newest(link),
-            mode_ns=status.mode_arrived_ns if status else None,
-            channels_ns=status.channels_arrived_ns if status else None,
-            is_receiver_sick=status is not None and status.is_receiver_sick,
-            is_position_valid=status is not None and status.is_position_valid is not False,
-            height_m=-status.position_ned_m[2] if status and status.position_ned_m else None,
-            is_landed=status.is_landed if status else None,
-            echo_confirmed=link.echo_confirmed,
-            is_released=link.is_released,
-            shows_last=link.shows_last,
-            refused_mode=link.refused_mode,
             chunk_problem=self._chunks.problem(now_ns) if is_sought else None,
             chunk_fault=chunk_fault,
             command_failed=given.command_fault is not None,
-            are_sticks_at_rest=link.are_sticks_at_rest,
-            stick_override_ns=status.stick_override_ns if status else None,
             slowness=given.command_fault or (self._chunks.impossibility if is_sought else None),
             is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
             envelope_problem=None if has_landed else left,

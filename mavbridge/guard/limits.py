@@ -10,7 +10,6 @@ from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
     Action,
-    ActionKind,
     ActionMeaning,
     ActionTrace,
     AttitudeThrust,
@@ -67,55 +66,6 @@ class ActionLimits:
         length = math.hypot(vector[one], vector[other])
         scale = longest / length if length > longest else 1.0
         values[one], values[other] = scale * vector[one], scale * vector[other]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LimitSettings:
-    """Bounds in the units of each action kind; a flight uses those of its own kind."""
-
-    stick_slew_per_s: float = 8.0
-    """Maximum stick speed, in full deflections per second; 0: no limit."""
-    lean_rad: float = math.radians(35.0)
-    """Largest lean of an attitude, roll and pitch combined."""
-    rate_radps: float = math.radians(220.0)
-    """Maximum roll and pitch rate."""
-    yaw_rate_radps: float = math.radians(120.0)
-    thrust: float = 0.9
-    speed_mps: float = 8.0
-    """Horizontal, in any direction."""
-    climb_mps: float = 3.0
-    """Up or down."""
-    accel_mps2: float = 5.0
-    """Maximum change of a velocity, in any horizontal direction and vertically."""
-
-    def of(self, kind: ActionKind) -> ActionLimits:
-        """Return the limits of one kind of action."""
-        free, lean, rate, yaw = math.inf, self.lean_rad, self.rate_radps, self.yaw_rate_radps
-        match kind:
-            case "sticks":
-                slew = self.stick_slew_per_s or free
-                return ActionLimits(low=(-1.0,) * 4, high=(1.0,) * 4, change_per_s=(slew,) * 4)
-            case "rates":
-                return ActionLimits(
-                    low=(0.0, -rate, -rate, -yaw),
-                    high=(self.thrust, rate, rate, yaw),
-                    change_per_s=(free,) * 4,
-                )
-            case "attitude":
-                return ActionLimits(
-                    low=(0.0, -lean, -lean, -yaw),
-                    high=(self.thrust, lean, lean, yaw),
-                    change_per_s=(free, rate, rate, free),
-                    pair=(1, 2),
-                )
-            case "velocity":
-                speed, climb, accel = self.speed_mps, self.climb_mps, self.accel_mps2
-                return ActionLimits(
-                    low=(-speed, -speed, -climb, -yaw),
-                    high=(speed, speed, climb, yaw),
-                    change_per_s=(accel, accel, accel, free),
-                    pair=(0, 1),
-                )
 
 
 def neutral_action(meaning: ActionMeaning) -> Action:

@@ -13,7 +13,6 @@ from typing import TypeVar
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
-    Action,
     Command,
     LinkArrivals,
     LinkSnapshot,
@@ -134,14 +133,14 @@ class GuardLoop:
             with suppress(Exception):
                 self._link.transmit(packet)
 
-    def _renew_words(self, snapshot: LinkSnapshot, output: GuardOutput) -> None:
+    def _renew_words(self, snapshot: LinkSnapshot, tick: GuardTick) -> None:
         """Prepare the last words when their inputs have changed, and periodically."""
         now_ns, status, outlet = self._clock.now_ns(), snapshot.status, self._link.outlet
-        basis: tuple[object, ...] = (output.phase, outlet)
+        basis: tuple[object, ...] = (tick.phase, outlet)
         if status is not None:
             basis += (status.mode, status.armed, status.is_landed, status.has_receiver)
             basis += (status.is_position_valid,)
-        is_old = output.slot is not None and now_ns >= self._words_due_ns
+        is_old = tick.slot is not None and now_ns >= self._words_due_ns
         if basis != self._words_basis or is_old:
             is_thrust = status is not None and status.mode in snapshot.modes.thrust
             self._words_due_ns = now_ns + (THRUST_WORDS_NS if is_thrust else WORDS_NS)
@@ -211,14 +210,18 @@ class GuardLoop:
         sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
         if isinstance(wanted, Command) and sent is None:
             self._guard.unsent()
-        if output.slot is not None or output.decision is not None or output.phase != self._phase:
-            self._report_tick(output, woke_ns, at_ns, sent)
+        tick = output.tick
+        is_slot = tick.slot is not None
+        if is_slot or output.decision is not None or tick.phase is not self._phase:
+            due_ns, sent_ns = tick.due_ns if is_slot else woke_ns, self._clock.now_ns()
+            tick = tick._replace(due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
+            self._flight.send(encode_from_guard(tick))
         self._follow(output)
-        if output.phase is not self._phase:
-            self._change_phase(output)
+        if tick.phase is not self._phase:
+            self._change_phase(tick)
         self._link.service()
-        self._renew_words(snapshot, output)
-        if output.phase is Phase.ENDED:
+        self._renew_words(snapshot, tick)
+        if tick.phase is Phase.ENDED:
             self._finish(woke_ns)
         # After a failed command the next pass follows at once.
         return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
@@ -255,13 +258,13 @@ class GuardLoop:
 
     def _follow(self, output: GuardOutput) -> None:
         """Send the requests to the vehicle, and the messages to the flight process."""
-        commands = self._link.commands
-        if output.mode is not None:
-            self._attempt(partial(commands.set_mode, output.mode))
-        if output.arm:
+        commands, actions = self._link.commands, output.actions
+        if actions.mode is not None:
+            self._attempt(partial(commands.set_mode, actions.mode))
+        if actions.arm:
             commands.arm()
-        if output.takeoff_m is not None:
-            self._attempt(partial(commands.takeoff, output.takeoff_m))
+        if actions.takeoff_m is not None:
+            self._attempt(partial(commands.takeoff, actions.takeoff_m))
         for text in output.messages:
             self._flight.send(encode_from_guard(GuardMessage(text)))
 
@@ -341,41 +344,19 @@ class GuardLoop:
             command_fault=self._command_fault,
         )
 
-    def _report_tick(
-        self, output: GuardOutput, woke_ns: int, decided_ns: int, sent: Action | None
-    ) -> None:
-        now_ns, slot = self._clock.now_ns(), output.slot
-        tick = GuardTick(
-            index=slot.index if slot else -1,
-            due_ns=slot.due_ns if slot else woke_ns,
-            woke_ns=woke_ns,
-            decided_ns=decided_ns,
-            sent_ns=now_ns,
-            missed_slots=slot.missed if slot else 0,
-            is_slot=slot is not None,
-            is_coasting=output.is_coasting,
-            chunk_serial=output.chunk_serial,
-            trace=output.trace,
-            sent=sent,
-            phase=output.phase,
-            reason=output.reason,
-            starting_ns=output.starting_ns,
-        )
-        self._flight.send(encode_from_guard(tick))
-
-    def _change_phase(self, output: GuardOutput) -> None:
+    def _change_phase(self, tick: GuardTick) -> None:
         """Announce on the link who has control."""
-        before, self._phase = self._phase, output.phase
+        before, self._phase = self._phase, tick.phase
         self._link.is_engaged = self._phase in _ENGAGED
         text: str | None = None
         match self._phase:
             case Phase.FLYING:
                 text = "the policy has control"
             case Phase.LEAVING:
-                text = f"neutral: {output.reason}"
+                text = f"neutral: {tick.reason}"
             case Phase.HOLDING:
                 text = "neutral sticks go on until you disarm or change the mode"
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
-                text = f"control given back: {output.reason}"
+                text = f"control given back: {tick.reason}"
         if text is not None:
             self._link.announce(f"mavbridge: {text}")

@@ -9,13 +9,15 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.sequences import (
-    DisengageSequence,
-    DisengageSettings,
-    EngageSequence,
-    EngageSettings,
+from mavbridge.guard.sequences import DisengageSequence, EngageSequence
+from mavbridge.guard.values import (
+    EndRequest,
+    EngagementInputs,
+    EngagementSettings,
+    OperatorCommand,
+    Outcome,
+    Phase,
 )
-from mavbridge.guard.values import EndRequest, EngagementInputs, OperatorCommand, Outcome, Phase
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
 """Time limit for mode change and arming, without the climb; a cold estimator needs some 40 s."""
@@ -24,24 +26,6 @@ ACT_TIMEOUT_NS = 3 * NS_PER_S
 REST_NS = 1_800 * NS_PER_MS
 """Least time that the engage switch must rest low before going high is an act. Receivers that
 dropped out for 0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EngagementSettings:
-    """Permitted ways to engage and disengage."""
-
-    engage: EngageSettings
-    disengage: DisengageSettings
-    arm: bool = False
-    """Arm once and engage once, as soon as everything is ready."""
-    engage_channel: int | None = None
-    """Receiver channel, counted from 1, that engages when it goes high after a rest in low."""
-    engage_on_arm: bool = False
-    """Engage when the vehicle is armed for the first time."""
-    readonly: bool = False
-    """Run the policy without sending anything."""
-    duration_ns: int | None = None
-    """Flight time from the first engagement; None: no limit."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -110,15 +94,15 @@ class Memory:
 
     def prepare(self, now: EngagementInputs, _cause: bool) -> None:
         """[the way in](#the-way-in)"""
-        self.own_mode = now.mode if now.armed else None
+        self.own_mode = now.status.mode if now.status.armed else None
         self.engage.begin(now)
         self.allowed_ns = ACT_TIMEOUT_NS
         if self.wants_arm:
-            climb_s = self.settings.engage.takeoff_m or 0.0  # at 1 m/s; usual is 1.5 m/s
+            climb_s = self.settings.takeoff_m or 0.0  # at 1 m/s; usual is 1.5 m/s
             self.allowed_ns = PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S)
         self.wants_arm = self.was_armed = False
         self.until_ns = now.now_ns + self.allowed_ns
-        self.seen_interruptions = now.interruptions
+        self.seen_interruptions = now.link.interruptions
 
     def give_up(self, _: EngagementInputs, cause: EndRequest) -> None:
         """say why; after `--arm` the guard ends"""
@@ -132,7 +116,11 @@ class Memory:
         """the policy's actions, starting from the pilot's or idle sticks"""
         flights = self.outcome.flights + 1
         self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
-        self.reason, self.own_mode, self.seen_interruptions = None, now.mode, now.interruptions
+        self.reason, self.own_mode, self.seen_interruptions = (
+            None,
+            now.status.mode,
+            now.link.interruptions,
+        )
         self.engaged_ns = now.now_ns if self.engaged_ns is None else self.engaged_ns
 
     def leave(self, now: EngagementInputs, cause: EndRequest) -> None:
@@ -146,7 +134,7 @@ class Memory:
         self.reason = cause.reason
         self.must_stop = self.must_stop and cause != self.end_request
         if cause.end in ("takeover", "disarmed"):
-            self.seen_interruptions = now.interruptions
+            self.seen_interruptions = now.link.interruptions
         self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal
         self.heard_ns = now.now_ns
 
@@ -170,14 +158,14 @@ class Memory:
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
         """an unconfirmed mode is reported"""
         mode = self.disengage.mode
-        if self.phase is Phase.LEAVING and mode is not None and mode != now.mode:
+        if self.phase is Phase.LEAVING and mode is not None and mode != now.status.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
         self.released_ns, self.owes_release = now.now_ns, True
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
         """nothing"""
         self.disengage.mode = None  # every later mode change comes from someone else
-        if not now.is_released:
+        if not now.link.is_released:
             self.refusal = because(Code.RELEASE_NOT_SEEN)
 
     def _note_end(self, cause: EndRequest) -> None:

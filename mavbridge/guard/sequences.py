@@ -5,7 +5,12 @@ from dataclasses import dataclass
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import OnFault
-from mavbridge.guard.values import Actions, ControlSource, EngagementInputs
+from mavbridge.guard.values import (
+    Actions,
+    ControlSource,
+    EngagementInputs,
+    EngagementSettings,
+)
 
 REQUEST_SPACING_NS = NS_PER_S
 """Time between requests to arm or change the mode: each refusal prints the vehicle's reason."""
@@ -46,42 +51,11 @@ MIDDLE_STICK = 0.2
 THR_DZ is 0.2 of the stick's travel to each side)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EngageSettings:
-    """Vehicle state required before the policy flies."""
-
-    modes: tuple[str, ...]
-    """Modes in which the policy may fly."""
-    mode: str | None = None
-    """Mode to request, one of ``modes``; None: the present one, or the first of ``modes`` if we arm
-    the vehicle."""
-    takeoff_m: float | None = None
-    """Height above the arming place to which the autopilot climbs autonomously, if we arm the
-    vehicle."""
-    is_setpoint: bool = False
-    """True if the policy's actions are setpoints, not sticks."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DisengageSettings:
-    """Actions after a fault, and at a normal end."""
-
-    on_fault: OnFault = "auto"
-    """auto: release if a hand would hold the vehicle, else hold."""
-    then: OnFault = "auto"
-    """auto: release if a hand would hold the vehicle, else land."""
-    is_setpoint: bool = False
-    """True if the policy's actions are setpoints: no sticks can take over, so a mode that holds
-    replaces the release, followed by silence."""
-    keeps_place: bool = False
-    """True: at an end, auto holds the vehicle before a hand gets it, for a policy that stops."""
-
-
 @dataclass(slots=True)
 class EngageSequence:
     """Mode, arming, takeoff: ``begin`` starts, ``step`` continues until nothing is missing."""
 
-    settings: EngageSettings
+    settings: EngagementSettings
     waits_for: Reason | None = None
     """Missing condition; None: ready to fly."""
     arms: bool = False
@@ -98,7 +72,7 @@ class EngageSequence:
 
     def begin(self, now: EngagementInputs) -> None:
         """Start from the vehicle's present state."""
-        self.arms = not now.armed
+        self.arms = not now.status.armed
         self.is_up = self.settings.takeoff_m is None or not self.arms
         self.asked_mode = self.ground_m = self.flows_from_ns = None
         self.lends_sticks = False
@@ -111,28 +85,32 @@ class EngageSequence:
     def is_own_mode(self, now: EngagementInputs) -> bool:
         """True if the present mode was requested, or belongs to the autopilot's takeoff."""
         has_takeoff = self.settings.takeoff_m is not None and self.arms
-        return now.mode == self.asked_mode or (has_takeoff and now.mode in now.modes.takeoff)
+        return now.status.mode == self.asked_mode or (
+            has_takeoff and now.status.mode in now.link.modes.takeoff
+        )
 
     def may_change_mode(self, now: EngagementInputs) -> bool:
         """True if an act requests another mode: the flag's, or one entered only by setpoints."""
         if self.settings.mode is not None:
-            return now.mode != self.settings.mode
-        needs_flow = self.settings.is_setpoint and now.modes.needs_setpoints_first
-        return needs_flow and now.mode not in self.settings.modes
+            return now.status.mode != self.settings.mode
+        needs_flow = self.settings.is_setpoint and now.link.modes.needs_setpoints_first
+        return needs_flow and now.status.mode not in self.settings.modes
 
     def wanted_mode(self, now: EngagementInputs) -> str | None:
         """Return the mode to request, or None if the present one is right."""
         wanted = self.settings.mode
         if not self.is_up:
-            wanted = now.mode if now.armed else next(iter(now.modes.takeoff), None)
-        elif wanted is None and now.mode not in self.settings.modes:
-            known = [mode for mode in self.settings.modes if mode in now.modes.names]
+            wanted = (
+                now.status.mode if now.status.armed else next(iter(now.link.modes.takeoff), None)
+            )
+        elif wanted is None and now.status.mode not in self.settings.modes:
+            known = [mode for mode in self.settings.modes if mode in now.link.modes.names]
             wanted = known[0] if known else self.settings.modes[0]
-        return None if wanted == now.mode else wanted
+        return None if wanted == now.status.mode else wanted
 
     def impossibility(self, now: EngagementInputs) -> Reason | None:
         """Return why waiting will not help, or None."""
-        names, wanted = now.modes.names, self.wanted_mode(now)
+        names, wanted = now.link.modes.names, self.wanted_mode(now)
         if wanted is None or not names or wanted in names:
             return now.slowness
         return because(Code.NO_SUCH_MODE, mode=wanted, modes=", ".join(names))
@@ -141,12 +119,12 @@ class EngageSequence:
         """Advance; with an ``objection``, keep the sticks going but request nothing."""
         self._watch_climb(now)
         wanted = self.wanted_mode(now)
-        climb_m = self.settings.takeoff_m if not self.is_up and now.armed else None
+        climb_m = self.settings.takeoff_m if not self.is_up and now.status.armed else None
         self._lend_sticks(now, wanted)
         control = self._control(now, wanted)
-        is_ready = now.armed and wanted is None and climb_m is None and objection is None
+        is_ready = now.status.armed and wanted is None and climb_m is None and objection is None
         self.waits_for = None if is_ready else objection or self._lack(now, wanted, climb_m)
-        is_heard = now.armed or now.echo_confirmed
+        is_heard = now.status.armed or now.link.echo_confirmed
         if self.waits_for is None or objection is not None or not is_heard:
             return Actions(control=control)
         if now.now_ns < self.request_due_ns:
@@ -156,11 +134,11 @@ class EngageSequence:
                 self.flows_from_ns = now.now_ns
             if now.now_ns - self.flows_from_ns < FLOW_NS:
                 return Actions(control=control)
-        if climb_m is not None and now.is_landed is False:
+        if climb_m is not None and now.status.is_landed is False:
             return Actions(control=control)
         self.request_due_ns = now.now_ns + REQUEST_SPACING_NS
         self.asked_mode = wanted
-        arm = wanted is None and not now.armed
+        arm = wanted is None and not now.status.armed
         return Actions(control=control, mode=wanted, arm=arm, takeoff_m=climb_m)
 
     def _lend_sticks(self, now: EngagementInputs, wanted: str | None) -> None:
@@ -168,22 +146,22 @@ class EngageSequence:
 
         From then on silence would be a failsafe.
         """
-        is_refused = wanted is not None and now.refused_mode == wanted == self.asked_mode
-        is_flown = wanted not in now.modes.setpoint and not self.settings.is_setpoint
-        lacks_sticks = now.modes.needs_sticks_first and now.has_receiver is False
+        is_refused = wanted is not None and now.link.refused_mode == wanted == self.asked_mode
+        is_flown = wanted not in now.link.modes.setpoint and not self.settings.is_setpoint
+        lacks_sticks = now.link.modes.needs_sticks_first and now.status.has_receiver is False
         if is_refused and is_flown and lacks_sticks and not self.has_sticks:
             self.lends_sticks, self.request_due_ns = True, now.now_ns
 
     def _watch_climb(self, now: EngagementInputs) -> None:
         takeoff_m = self.settings.takeoff_m
-        if not now.armed:
-            self.ground_m = now.height_m
-        elif not self.is_up and now.height_m is not None and takeoff_m is not None:
-            self.ground_m = now.height_m if self.ground_m is None else self.ground_m
-            self.is_up = now.height_m - self.ground_m >= ARRIVED * takeoff_m
+        if not now.status.armed:
+            self.ground_m = now.status.height_m
+        elif not self.is_up and now.status.height_m is not None and takeoff_m is not None:
+            self.ground_m = now.status.height_m if self.ground_m is None else self.ground_m
+            self.is_up = now.status.height_m - self.ground_m >= ARRIVED * takeoff_m
 
     def _lack(self, now: EngagementInputs, wanted: str | None, climb_m: float | None) -> Reason:
-        if not self.is_up and now.height_m is None:
+        if not self.is_up and now.status.height_m is None:
             return because(Code.TAKEOFF_NEEDS_POSITION)
         if climb_m is not None:
             return because(Code.TAKING_OFF, height_m=climb_m)
@@ -197,8 +175,8 @@ class EngageSequence:
         A person who armed the vehicle keeps the sticks until the policy takes over. Setpoints would
         end a takeoff, but some modes can be entered only while setpoints flow.
         """
-        is_climbing = self.arms and now.armed and self.settings.takeoff_m is not None
-        if now.link_problem is not None:
+        is_climbing = self.arms and now.status.armed and self.settings.takeoff_m is not None
+        if now.link.problem is not None:
             # Without a receiver the end of sticks is a failsafe, even if we hear nothing.
             is_held = is_climbing and not self.settings.is_setpoint
             return ControlSource.NEUTRAL if is_held else None
@@ -207,8 +185,8 @@ class EngageSequence:
                 return None
             if self.arms and self.settings.takeoff_m is None:
                 return ControlSource.IDLE
-            mode = wanted or now.mode  # setpoints also keep the mode once entered
-            needs_flow = now.modes.needs_setpoints_first and mode in now.modes.setpoint
+            mode = wanted or now.status.mode  # setpoints also keep the mode once entered
+            needs_flow = now.link.modes.needs_setpoints_first and mode in now.link.modes.setpoint
             return ControlSource.NEUTRAL if needs_flow else None
         if not self.has_sticks:
             return None
@@ -220,7 +198,7 @@ class EngageSequence:
 class DisengageSequence:
     """Neutral, a safe mode, then the release: ``begin`` starts, ``step`` continues."""
 
-    settings: DisengageSettings
+    settings: EngagementSettings
     mode: str | None = None
     """Requested safe mode; a change to it is no takeover."""
     is_done: bool = False
@@ -254,12 +232,14 @@ class DisengageSequence:
         self.began_ns = now.now_ns
         self.asked_ns = self.undone_ns = None
         self.has_failed = self.is_done = False
-        self.is_thrust_mode = now.mode in now.modes.thrust
-        self.is_silence_failsafe = now.has_receiver is not True or now.modes.is_silence_failsafe
+        self.is_thrust_mode = now.status.mode in now.link.modes.thrust
+        self.is_silence_failsafe = (
+            now.status.has_receiver is not True or now.link.modes.is_silence_failsafe
+        )
         choice, note = self.settings.on_fault if is_fault else self.settings.then, None
         objection = self._hand_objection(now)
         self.may_release = objection is None
-        if choice == "release" and now.is_landed:
+        if choice == "release" and now.status.is_landed:
             self.may_release = True
         elif choice in ("auto", "release"):
             instead: OnFault = "hold" if is_fault else "land"
@@ -270,31 +250,31 @@ class DisengageSequence:
             released: OnFault = "hold" if is_kept else "release"
             choice = released if objection is None else instead
         # A pilot's sticks would do nothing in a setpoint mode or during the autopilot's takeoff.
-        is_deaf = now.mode in (*now.modes.setpoint, *now.modes.takeoff)
+        is_deaf = now.status.mode in (*now.link.modes.setpoint, *now.link.modes.takeoff)
         if choice == "release" and (self.settings.is_setpoint or is_deaf):
             choice = "hold"
-        if choice == "hold" and not now.is_position_valid:
+        if choice == "hold" and now.status.is_position_valid is False:
             choice = "land"  # BRAKE and LOITER are refused without a position
-        roles = now.modes
+        roles = now.link.modes
         by_choice = {"hold": roles.hold, "land": roles.land, "rtl": roles.rtl}
         self.mode = by_choice.get(choice) or None
         return note
 
     def _hand_objection(self, now: EngagementInputs) -> Reason | None:
         """Return why the pilot's sticks would not hold the vehicle in its present mode, or None."""
-        if now.has_receiver is not True:
+        if now.status.has_receiver is not True:
             return because(Code.NO_RECEIVER)
-        if now.is_landed:
+        if now.status.is_landed:
             return None
-        if now.is_receiver_sick:
+        if now.status.is_receiver_sick:
             return because(Code.RECEIVER_LOST)
-        if now.modes.is_silence_failsafe and not self.settings.is_setpoint:
+        if now.link.modes.is_silence_failsafe and not self.settings.is_setpoint:
             return because(Code.SILENCE_IS_FAILSAFE)
-        if now.mode in now.modes.thrust:
-            return because(Code.THROTTLE_IS_THRUST, mode=now.mode)
-        if now.pilot_sticks is None:
+        if now.status.mode in now.link.modes.thrust:
+            return because(Code.THROTTLE_IS_THRUST, mode=now.status.mode)
+        if now.status.pilot_sticks is None:
             return because(Code.THROTTLE_UNKNOWN)
-        throttle = now.pilot_sticks.throttle
+        throttle = now.status.pilot_sticks.throttle
         if abs(throttle) > MIDDLE_STICK:
             percent, most = 100 * throttle, 100 * MIDDLE_STICK
             return because(Code.THROTTLE_RESTS, percent=percent, limit_percent=most)
@@ -305,41 +285,41 @@ class DisengageSequence:
 
         The vehicle shows our sticks and no others, and its EVENT reports moved sticks.
         """
-        if self.mode is None or self.asked_ns is None or now.mode != now.modes.override:
+        if self.mode is None or self.asked_ns is None or now.status.mode != now.link.modes.override:
             return False
-        if not now.echo_confirmed or now.overruled is not None:
+        if not now.link.echo_confirmed or now.link.is_overruled:
             return False
         undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
         is_undecided = now.now_ns - undone_ns <= WORD_NS
         return undone_ns - self.entered_ns <= UNDONE_NS and (is_undecided or self._is_told(now))
 
     def _is_told(self, now: EngagementInputs) -> bool:
-        told_ns = now.stick_override_ns
+        told_ns = now.status.stick_override_ns
         return told_ns is not None and self.asked_ns is not None and told_ns >= self.asked_ns
 
     def _watch_undoing(self, now: EngagementInputs) -> None:
         if self.mode is None or self.asked_ns is None:
             return
-        if not now.echo_confirmed or now.overruled is not None:
+        if not now.link.echo_confirmed or now.link.is_overruled:
             return
-        if now.mode == now.modes.override:
+        if now.status.mode == now.link.modes.override:
             self.undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
         elif self.undone_ns is not None:  # back in our mode: the next exit needs its own EVENT
             self.asked_ns, self.undone_ns = now.now_ns, None
 
     def _are_at_rest(self, now: EngagementInputs) -> bool:
         """True if neutral sticks were sent and no longer look like a hand."""
-        if self.settings.is_setpoint or not now.modes.override:
+        if self.settings.is_setpoint or not now.link.modes.override:
             return True
         is_bounded = now.now_ns - self.began_ns >= STICK_REST_NS
         self.has_failed = self.has_failed or now.command_failed
         if self.has_failed:
             return is_bounded  # the time at which neutral was sent is unknown
-        return is_bounded or (now.are_sticks_at_rest and now.now_ns > self.began_ns)
+        return is_bounded or (now.link.are_sticks_at_rest and now.now_ns > self.began_ns)
 
     def _may_ask(self, now: EngagementInputs, unheard_ns: int | None) -> bool:
         """True if the mode is known, or the vehicle's failsafe cannot have acted yet."""
-        has_failsafe = self.is_silence_failsafe or now.modes.needs_setpoints_first
+        has_failsafe = self.is_silence_failsafe or now.link.modes.needs_setpoints_first
         blind_ns = FAILSAFE_BLIND_NS if has_failsafe else BLIND_NS
         return unheard_ns is None or now.now_ns - unheard_ns <= blind_ns
 
@@ -348,14 +328,14 @@ class DisengageSequence:
 
         ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: known.
         """
-        is_confirmed = self.mode is None or now.mode == self.mode
+        is_confirmed = self.mode is None or now.status.mode == self.mode
         is_safe = self.may_release or (self.mode is not None and is_confirmed)
         self.must_hold = not self.settings.is_setpoint and (self.is_silence_failsafe or not is_safe)
         if unheard_ns is not None:  # the timeout starts when the vehicle is heard
             self.asks_until_ns = now.now_ns + MODE_TIMEOUT_NS
         # No vehicle refuses to land: such an answer is a late one to the previous request.
-        if not is_confirmed and now.refused_mode == self.mode:
-            self.mode = now.modes.land or None
+        if not is_confirmed and now.link.refused_mode == self.mode:
+            self.mode = now.link.modes.land or None
         elapsed_ns = now.now_ns - self.began_ns
         self._watch_undoing(now)
         is_undone = self.is_undone(now)
@@ -366,13 +346,13 @@ class DisengageSequence:
         self.is_done = not is_undone and (self.is_done or is_over)
         # In thrust modes neutral would climb or fall, so the mode change comes first. Even after
         # it, the vehicle may take our jump to neutral for a hand.
-        is_entered = bool(self.mode) and is_confirmed and not now.modes.override
+        is_entered = bool(self.mode) and is_confirmed and not now.link.modes.override
         is_level_only = self.is_thrust_mode and not is_entered
         control: ControlSource | None
         control = ControlSource.LEVEL if is_level_only else ControlSource.NEUTRAL
-        if self.settings.is_setpoint and now.is_landed:
+        if self.settings.is_setpoint and now.status.is_landed:
             control = ControlSource.IDLE  # hover thrust would lift it
-        may_pull_back = self.settings.is_setpoint and now.modes.needs_setpoints_first
+        may_pull_back = self.settings.is_setpoint and now.link.modes.needs_setpoints_first
         if may_pull_back and elapsed_ns > SETPOINT_NS:
             control = None
         is_due = now.now_ns >= self.request_due_ns and self._may_ask(now, unheard_ns)
@@ -382,6 +362,6 @@ class DisengageSequence:
             return Actions(control=control)
         if not is_undone:
             self.asked_ns = self.entered_ns = now.now_ns
-        is_slow = is_late and now.link_problem is None  # each refusal prints a reason
+        is_slow = is_late and now.link.problem is None  # each refusal prints a reason
         self.request_due_ns = now.now_ns + (SLOW_SPACING_NS if is_slow else MODE_SPACING_NS)
         return Actions(control=control, mode=self.mode)

@@ -7,7 +7,7 @@ from mavbridge.core.vehicle import ActionMeaning, Output
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import Smoothing
-from mavbridge.guard.memory import EngagementSettings
+from mavbridge.guard.values import EngagementSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,8 +17,6 @@ class GuardSettings:
     link: LinkSettings
     realtime: bool = True
     """Use real-time scheduling if the system permits it."""
-    cpu: int | None = None
-    """The only CPU to run on; None: any."""
     tlog_fd: int | None = None
     """Write end of the telemetry log's pipe."""
     keeps_packets: bool = False

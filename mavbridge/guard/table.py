@@ -55,12 +55,12 @@ def arm_flag(m: Memory, now: EngagementInputs) -> bool:
 
     Once, as soon as the link is ready.
     """
-    return m.wants_arm and now.link_problem is None
+    return m.wants_arm and now.link.problem is None
 
 
 def not_set(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """the vehicle did not take a `--set`, and `--arm` waits for it"""
-    problem = now.link_problem
+    problem = now.link.problem
     if not m.wants_arm or problem is None or problem.code not in NOT_SET:
         return None
     return EndRequest(problem, is_fault=True)
@@ -77,14 +77,14 @@ def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
         return None
     if m.phase in (LEAVING, HOLDING, RELEASING):
         return because(Code.STILL_ENDING, phase=m.phase.value)
-    if not now.armed:
+    if not now.status.armed:
         return because(Code.NOT_ARMED)
     if (reason := objection(m, now) or now.chunk_problem) is not None:
         return reason
-    modes = m.settings.engage.modes
-    if m.engage.may_change_mode(now) or now.mode in modes:
+    modes = m.settings.modes
+    if m.engage.may_change_mode(now) or now.status.mode in modes:
         return None
-    return because(Code.WRONG_MODE, mode=now.mode, allowed=" or ".join(modes))
+    return because(Code.WRONG_MODE, mode=now.status.mode, allowed=" or ".join(modes))
 
 
 def engage(m: Memory, _: EngagementInputs) -> bool:
@@ -120,7 +120,7 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """
     if (reason := _takeover(m, now)) is None:
         return None
-    return EndRequest(reason, is_fault=True, end="takeover" if now.armed else "disarmed")
+    return EndRequest(reason, is_fault=True, end="takeover" if now.status.armed else "disarmed")
 
 
 def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
@@ -139,9 +139,9 @@ def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
         problem = because(
             Code.NOT_READY,
             after_s=m.allowed_ns / NS_PER_S,
-            mode=now.mode,
-            is_armed=now.armed,
-            is_echoed=now.echo_confirmed,
+            mode=now.status.mode,
+            is_armed=now.status.armed,
+            is_echoed=now.link.echo_confirmed,
             inputs=now.chunk_problem or "fine",
         )
     return EndRequest(not_engaged(problem) if m.is_act else problem, is_fault=True)
@@ -168,7 +168,7 @@ def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
     refused our packets for 100 ms; the vehicle does not hear our sticks; a command could not be
     encoded; the vehicle's clock was set back; or the vehicle sends from another address.
     """
-    reason = now.link_problem or now.chunk_fault or now.envelope_problem
+    reason = now.link.problem or now.chunk_fault or now.envelope_problem
     return None if reason is None else EndRequest(reason, is_fault=True)
 
 
@@ -185,8 +185,8 @@ def released(m: Memory, now: EngagementInputs) -> bool:
     4 s if it does not even show our last sticks; the outcome then says that the release was not
     seen.
     """
-    timeout_ns = RELEASE_TIMEOUT_NS if now.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
-    return (now.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
+    timeout_ns = RELEASE_TIMEOUT_NS if now.link.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
+    return (now.link.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
 
 
 def ready(m: Memory, now: EngagementInputs) -> bool:
@@ -214,7 +214,7 @@ def is_ours(m: Memory, now: EngagementInputs) -> bool:
 
     We have armed it, or it flies by our neutral sticks or setpoints.
     """
-    return (m.engage.has_sticks and now.armed) or follows_us(m, now)
+    return (m.engage.has_sticks and now.status.armed) or follows_us(m, now)
 
 
 def follows_us(m: Memory, now: EngagementInputs) -> bool:
@@ -226,9 +226,9 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
     """
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
-        (m.settings.engage.is_setpoint and now.armed and is_own)
-        and (now.overruled is None and not now.is_failsafe)
-        and (now.mode == m.own_mode and now.mode in now.modes.setpoint)
+        (m.settings.is_setpoint and now.status.armed and is_own)
+        and (not now.link.is_overruled and not now.status.is_failsafe)
+        and (now.status.mode == m.own_mode and now.status.mode in now.link.modes.setpoint)
     )
 
 
@@ -243,10 +243,10 @@ def may_release(m: Memory, _: EngagementInputs) -> bool:
 
 def objection(m: Memory, now: EngagementInputs) -> Reason | None:
     """Return why the policy may not take the sticks of an armed vehicle now, or None."""
-    if now.link_problem is not None:
-        return now.link_problem
-    if now.is_failsafe:
-        return because(Code.FAILSAFE, mode=now.mode)
+    if now.link.problem is not None:
+        return now.link.problem
+    if now.status.is_failsafe:
+        return because(Code.FAILSAFE, mode=now.status.mode)
     if m.switch.is_off:
         return _switch_off(m)
     return now.envelope_problem
@@ -258,22 +258,22 @@ def _switch_off(m: Memory) -> Reason:
 
 def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     is_preparing = m.phase is Phase.PREPARING
-    if now.interruptions != m.seen_interruptions:
-        return now.interruption
-    if now.overruled is not None:
-        return now.overruled
-    if now.is_switched_off:
+    if now.link.interruptions != m.seen_interruptions:
+        return now.link.interruption
+    if now.link.is_overruled:
+        return now.link.problem
+    if now.link.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
     if m.switch.is_off and (m.phase is Phase.FLYING or (is_preparing and m.is_act)):
         return _switch_off(m)
-    if not now.armed and not is_preparing:
+    if not now.status.armed and not is_preparing:
         return because(Code.DISARMED)
-    if now.is_failsafe and now.armed:
-        return because(Code.FAILSAFE, mode=now.mode)
-    is_ours = now.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
+    if now.status.is_failsafe and now.status.armed:
+        return because(Code.FAILSAFE, mode=now.status.mode)
+    is_ours = now.status.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
     if m.own_mode is not None and not is_ours:
-        return because(Code.MODE_CHANGED, before=m.own_mode, after=now.mode)
-    return because(Code.DISARMED) if is_preparing and m.was_armed and not now.armed else None
+        return because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
+    return because(Code.DISARMED) if is_preparing and m.was_armed and not now.status.armed else None
 
 
 class Transition(NamedTuple):

@@ -5,10 +5,14 @@ from enum import Enum
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.reasons import Reason
-from mavbridge.core.vehicle import FlightEnd, ModeRoles, Sticks
+from mavbridge.core.vehicle import FlightEnd, LinkSnapshot, OnFault, VehicleStatus
 
 OperatorCommand: TypeAlias = Literal["engage", "release"]
 """Explicit command of the operator at the terminal."""
+
+
+NOT_FOUND = VehicleStatus(mode="unknown", armed=False)
+"""Status before a vehicle has been found."""
 
 
 class Phase(Enum):
@@ -66,6 +70,39 @@ class Outcome(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EngagementSettings:
+    """Permitted ways to engage, and what follows a flight."""
+
+    modes: tuple[str, ...]
+    """Modes in which the policy may fly."""
+    mode: str | None = None
+    """Mode to request, one of ``modes``; None: the present one, or the first of ``modes`` if we arm
+    the vehicle."""
+    is_setpoint: bool = False
+    """True if the policy's actions are setpoints, not sticks: no sticks can take over, so a mode
+    that holds replaces the release, followed by silence."""
+    arm: bool = False
+    """Arm once and engage once, as soon as everything is ready."""
+    takeoff_m: float | None = None
+    """Height above the arming place to which the autopilot climbs autonomously, if we arm the
+    vehicle."""
+    engage_channel: int | None = None
+    """Receiver channel, counted from 1, that engages when it goes high after a rest in low."""
+    engage_on_arm: bool = False
+    """Engage when the vehicle is armed for the first time."""
+    readonly: bool = False
+    """Run the policy without sending anything."""
+    duration_ns: int | None = None
+    """Flight time from the first engagement; None: no limit."""
+    on_fault: OnFault = "auto"
+    """auto: release if a hand would hold the vehicle, else hold."""
+    then: OnFault = "auto"
+    """At a normal end. auto: release if a hand would hold the vehicle, else land."""
+    keeps_place: bool = False
+    """True: at an end, auto holds the vehicle before a hand gets it, for a policy that stops."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Actions:
     """Actions of the guard at one moment."""
 
@@ -84,49 +121,11 @@ class EngagementInputs:
     """State of the vehicle, the link and the policy at one moment."""
 
     now_ns: int
-    is_connected: bool
-    """True if a vehicle has been found and its status is known."""
-    link_problem: Reason | None
-    """Why sticks must not be sent: no heartbeat, unfinished handshake, a risk not accepted."""
-    interruption: Reason | None
-    """Why all engagements so far are over: a reboot or a new address; see ``LinkSnapshot``."""
-    interruptions: int = 0
-    """Number of interruptions so far."""
-    overruled: Reason | None
-    """Why the vehicle seems to follow other sticks than ours, or None."""
-    is_switched_off: bool
-    """True if the pilot's override switch is low."""
-    mode: str
-    modes: ModeRoles
-    """Modes of this vehicle; empty before it is found."""
-    armed: bool
-    is_failsafe: bool
-    has_receiver: bool | None
-    is_receiver_sick: bool = False
-    """True if the vehicle reports that its receiver does not work."""
-    pilot_sticks: Sticks | None
-    """The receiver's sticks when we last sent none."""
-    rc_channels_us: tuple[int, ...]
-    """Fresh radio channels, 0 if undriven; empty if stale."""
-    is_position_valid: bool
-    height_m: float | None
-    """Height above the estimator's origin; None without a valid position."""
-    is_landed: bool | None
-    echo_confirmed: bool
-    is_released: bool
-    shows_last: bool = True
-    """True if the vehicle shows our last sticks, or a receiver's that look the same."""
-    are_sticks_at_rest: bool = True
-    """True if our last sticks do not look like a hand, which would end an autonomous mode."""
-    stick_override_ns: int | None = None
-    """Vehicle's last report that moving sticks have changed its mode."""
-    refused_mode: str | None
+    link: LinkSnapshot
+    status: VehicleStatus
+    """The link's, or ``NOT_FOUND``."""
     heard_ns: int | None = None
-    """Arrival of the newest packet; None: now."""
-    mode_ns: int | None = None
-    """Arrival of the newest message that reports the mode; None: now."""
-    channels_ns: int | None = None
-    """Arrival of ``rc_channels_us``; None: now."""
+    """Newest arrival of a mode, RC_CHANNELS or an attitude; None: now."""
     chunk_problem: Reason | None
     """Why no flight may begin now: no fresh chunk."""
     chunk_fault: Reason | None

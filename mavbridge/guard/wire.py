@@ -1,7 +1,8 @@
 """Encoding of the messages between the flight process and the guard.
 
-Messages at loop rate are little-endian structures, the others pickles. Pickles are safe here: one
-process has started the other, and no third one has an end of the channel.
+Samples and chunks, which lie between an attitude and its command, are little-endian structures; all
+others are pickles. Pickles are safe here: one process has started the other, and no third one has
+an end of the channel.
 """
 
 import io
@@ -32,14 +33,10 @@ from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _ACTION = struct.Struct("<4d")
-_TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
 _QUANTITIES = Telemetry._fields
 _SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
 """Layout of a sample by quantity: index, arrival, delay, values."""
-_PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
-_IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
-_NOTHING = (0.0,) * 4
 _PICKLE = b"S"
 _MALFORMED = (
     *(struct.error, pickle.UnpicklingError, EOFError),
@@ -48,11 +45,11 @@ _MALFORMED = (
 """Errors of the decoders on malformed bytes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GuardTick:
+class GuardTick(NamedTuple):
     """One send of the guard, or one slot without anything to send."""
 
-    index: int
+    slot: int | None
+    """Number of the slot on the stick grid; None between slots."""
     due_ns: int
     woke_ns: int
     decided_ns: int
@@ -60,7 +57,6 @@ class GuardTick:
     sent_ns: int
     """Time after the sticks were handed to the kernel."""
     missed_slots: int
-    is_slot: bool
     is_coasting: bool
     chunk_serial: int | None
     trace: ActionTrace | None
@@ -187,22 +183,14 @@ def decode_to_guard(data: bytes) -> ToGuard:
 
 def encode_from_guard(message: FromGuard) -> bytes:
     """Encode a message of the guard."""
-    match message:
-        case GuardTick():
-            return _encode_tick(message)
-        case Samples(samples):
-            return encode_samples(samples)
-    return _pickled(message)
+    return encode_samples(message.samples) if isinstance(message, Samples) else _pickled(message)
 
 
 def decode_from_guard(data: bytes) -> FromGuard:
     """Decode a message of the guard; raise ValueError if it is malformed."""
     try:
-        match data[:1]:
-            case b"T":
-                return _decode_tick(data)
-            case b"R":
-                return Samples(tuple(decode_samples(data)))
+        if data[:1] == b"R":
+            return Samples(tuple(decode_samples(data)))
         message: FromGuard = _unpickled(data, get_args(FromGuard))
     except _MALFORMED as error:
         raise ValueError(f"not a message of the guard: {data[:16]!r}") from error
@@ -259,58 +247,6 @@ def _decode_chunk(data: bytes) -> Chunk:
         raise ValueError("a chunk of another length")
     actions = _ACTION.iter_unpack(memoryview(data)[_CHUNK.size :])
     return Chunk._make((*stamps, tuple(map(_CLASSES[kind]._make, actions)), reset_ns))
-
-
-def _encode_tick(tick: GuardTick) -> bytes:
-    flags = (
-        _IS_SLOT * tick.is_slot
-        | _IS_COASTING * tick.is_coasting
-        | _HAS_TRACE * (tick.trace is not None)
-        | _HAS_SENT * (tick.sent is not None)
-    )
-    trace, serial = tick.trace, tick.chunk_serial
-    stages = _NOTHING * 4
-    if trace is not None:
-        stages = (*trace.raw, *trace.clipped, *trace.slewed, *trace.smoothed)
-    packed = _TICK.pack(
-        b"T",
-        *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns, tick.starting_ns),
-        *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
-        _PHASES.index(tick.phase),
-        0 if trace is None else _CLASSES.index(type(trace.raw)),
-        0 if tick.sent is None else _CLASSES.index(type(tick.sent)),
-        *stages,
-        *(tick.sent or _NOTHING),
-    )
-    return packed if tick.reason is None else packed + _pickled(tick.reason)
-
-
-def _decode_tick(data: bytes) -> GuardTick:
-    _, index, due_ns, woke_ns, decided_ns, sent_ns, starting_ns, *rest = _TICK.unpack_from(data)
-    serial, flags, has_chunk, missed, phase, traced, sent_kind, *values = rest
-    fours = [values[4 * k : 4 * k + 4] for k in range(5)]
-    raw, clipped, slewed, smoothed = (_CLASSES[traced](*four) for four in fours[:4])
-    trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
-    sent = _CLASSES[sent_kind](*fours[4])
-    reason: Reason | None = None
-    if len(data) > _TICK.size:
-        reason = _unpickled(data[_TICK.size :], (Reason,))
-    return GuardTick(
-        index=index,
-        due_ns=due_ns,
-        woke_ns=woke_ns,
-        decided_ns=decided_ns,
-        sent_ns=sent_ns,
-        missed_slots=missed,
-        is_slot=bool(flags & _IS_SLOT),
-        is_coasting=bool(flags & _IS_COASTING),
-        starting_ns=starting_ns,
-        chunk_serial=serial if has_chunk else None,
-        trace=trace if flags & _HAS_TRACE else None,
-        sent=sent if flags & _HAS_SENT else None,
-        phase=_PHASES[phase],
-        reason=reason,
-    )
 
 
 def encode_samples(samples: Iterable[Sample]) -> bytes:

@@ -205,7 +205,7 @@ class SimulatedFlight:
         for name, value in needed_params(contract, self._vehicle_config.autopilot).items():
             self.vehicle.params.set(name, value)
         vision_clocks = [AheadClock(world) for _ in contract.cameras]
-        cameras = self._make_cameras(contract, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
+        cameras = self._make_cameras(contract, camera_hz=max(loops.vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)
         send(plan.guard)
         past_ns = observation_ages_ns(contract)[0]

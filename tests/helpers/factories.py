@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Solve, Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
+from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardTick
+from policy.contract import Contract
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS
@@ -36,6 +39,12 @@ def make_state(at_ns: int = START_NS, **changes: Any) -> VehicleState:
         specific_force_ns=at_ns,
     )
     return replace(state, **changes)
+
+
+def make_plan(contract: Contract | None = None, **config: Any) -> FlightPlan:
+    """Return the plan of a flight at two rates with the default contract and flags."""
+    flags = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:14550"), **config)
+    return plan_flight(flags, contract or Contract(), is_dual=True)
 
 
 def make_trace(sticks: Sticks = NEUTRAL) -> ActionTrace:
@@ -132,13 +141,12 @@ def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_guard_tick(at_ns: int, **changes: Any) -> GuardTick:
     """Return a slot that the guard served in time, with nothing to send."""
     tick = GuardTick(
-        index=0,
+        slot=0,
         due_ns=at_ns,
         woke_ns=at_ns,
         decided_ns=at_ns,
         sent_ns=at_ns,
         missed_slots=0,
-        is_slot=True,
         is_coasting=False,
         chunk_serial=None,
         trace=None,
@@ -146,4 +154,4 @@ def make_guard_tick(at_ns: int, **changes: Any) -> GuardTick:
         phase=Phase.WAITING,
         reason=None,
     )
-    return replace(tick, **changes)
+    return tick._replace(**changes)

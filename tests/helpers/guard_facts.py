@@ -1,19 +1,34 @@
 """Facts of a vehicle that flies well, and an engagement stepped through them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
+from mavbridge.config.flight import FlyConfig, Limits, LinkConfig, SetpointLimits
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, Value
-from mavbridge.core.vehicle import NEUTRAL, ActionMeaning, ModeRoles
+from mavbridge.core.vehicle import (
+    NEUTRAL,
+    ActionKind,
+    ActionMeaning,
+    LinkSnapshot,
+    ModeRoles,
+    Telemetry,
+    VehicleStatus,
+)
+from mavbridge.flight.settings import action_limits
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.limits import LimitSettings, Smoothing
-from mavbridge.guard.memory import EngagementSettings
-from mavbridge.guard.sequences import DisengageSettings, EngageSettings
+from mavbridge.guard.limits import ActionLimits, Smoothing
 from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import Actions, EndRequest, EngagementInputs, OperatorCommand, Phase
+from mavbridge.guard.values import (
+    Actions,
+    EndRequest,
+    EngagementInputs,
+    EngagementSettings,
+    OperatorCommand,
+    Phase,
+)
 
 MODES = ("ALT_HOLD", "ALTCTL")
 COPTER_MODES = ModeRoles(
@@ -39,53 +54,73 @@ PX4_MODES = ModeRoles(
     needs_sticks_first=True,
 )
 STEP_NS = 10 * NS_PER_MS
+LINK = LinkConfig(connect="memory")
 
-AIRBORNE = EngagementInputs(
-    now_ns=0,
-    is_connected=True,
-    link_problem=None,
-    interruption=None,
-    overruled=None,
-    is_switched_off=False,
+_STATUS = VehicleStatus(
     mode="ALT_HOLD",
-    modes=COPTER_MODES,
     armed=True,
-    is_failsafe=False,
     has_receiver=True,
     pilot_sticks=NEUTRAL,
     rc_channels_us=(1500,) * 8,
     is_position_valid=True,
-    height_m=10.0,
+    position_ned_m=(0.0, 0.0, -10.0),
     is_landed=False,
-    echo_confirmed=True,
-    is_released=False,
-    refused_mode=None,
+)
+AIRBORNE = EngagementInputs(
+    now_ns=0,
+    link=LinkSnapshot(
+        telemetry=Telemetry(),
+        status=_STATUS,
+        problem=None,
+        modes=COPTER_MODES,
+        echo_confirmed=True,
+        is_released=False,
+    ),
+    status=_STATUS,
     chunk_problem=None,
     chunk_fault=None,
     envelope_problem=None,
 )
 """Armed in ALT_HOLD, in the air, with a centred receiver and a policy within its limits."""
-ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
+
+
+def altered(facts: EngagementInputs, **changes: Any) -> EngagementInputs:
+    """Return the facts with other fields, those of the link and of the vehicle's status included.
+
+    ``height_m`` changes the position.
+    """
+    if "height_m" in changes:
+        height_m = changes.pop("height_m")
+        changes["position_ned_m"] = None if height_m is None else (0.0, 0.0, -height_m)
+    status, link = (
+        {each.name: changes.pop(each.name) for each in fields(record) if each.name in changes}
+        for record in (VehicleStatus, LinkSnapshot)
+    )
+    if status:
+        changes["status"] = link["status"] = replace(facts.status, **status)
+    return replace(facts, link=replace(facts.link, **link), **changes)
+
+
+ON_GROUND = altered(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
 
 
 def stick_smoothing(
     *, max_slew_per_s: float = 0.0, tau_s: float = 0.0, max_dt_s: float = 0.15
 ) -> Smoothing:
     """Return a filter of sticks; without arguments it changes nothing."""
-    limits = LimitSettings(stick_slew_per_s=max_slew_per_s).of("sticks")
+    config = FlyConfig(link=LINK, limits=Limits(max_slew=max_slew_per_s))
+    limits = action_limits(config, "sticks")
     return Smoothing(limits=limits, tau_s=tau_s, max_dt_s=max_dt_s)
 
 
+def limits_of(kind: ActionKind, **setpoints: float) -> ActionLimits:
+    """Return the limits of a kind of action with these flags of the section setpoints."""
+    return action_limits(FlyConfig(link=LINK, setpoints=SetpointLimits(**setpoints)), kind)
+
+
 def engagement_settings(**settings: Any) -> EngagementSettings:
-    """Return settings of the engagement and its ways in; modes are ``MODES``."""
-    ways_in = ("modes", "mode", "takeoff_m", "is_setpoint")
-    engage = {name: settings.pop(name) for name in ways_in if name in settings}
-    disengage = settings.pop("disengage", DisengageSettings())
-    return EngagementSettings(
-        engage=EngageSettings(**{"modes": MODES, **engage}),
-        disengage=disengage,
-        **settings,
-    )
+    """Return settings of the engagement; modes are ``MODES``."""
+    return EngagementSettings(**{"modes": MODES, **settings})
 
 
 def flight_settings(**changes: Any) -> FlightSettings:
@@ -135,8 +170,8 @@ class Stepped:
         if stop is not None:
             self.engagement.stop(stop)
         if changes.get("interruption") is not None:
-            changes.setdefault("interruptions", self.facts.interruptions + 1)
-        self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
+            changes.setdefault("interruptions", self.facts.link.interruptions + 1)
+        self.facts = altered(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
         self.moves.append(self.engagement.step(self.facts, act))
         return self.moves[-1]
 

@@ -1,5 +1,6 @@
 """A guard with its real output and sender; vehicle, pilot and flight process are set by hand."""
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -7,7 +8,7 @@ from typing import Any
 
 from helpers.fakes import FOREVER_NS, START_NS, FakeClock, level_telemetry
 from helpers.flown_vehicle import FlownVehicle
-from helpers.guard_facts import engagement_settings
+from helpers.guard_facts import engagement_settings, limits_of
 from helpers.wire import ARDUPILOT as CALIBRATION
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
@@ -17,6 +18,7 @@ from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
     LinkSnapshot,
+    OnFault,
     Output,
     Sticks,
     VehicleStatus,
@@ -25,8 +27,7 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
-from mavbridge.guard.limits import LimitSettings, Smoothing
-from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.mavlink.codec.messages import Body, ManualControl, RcChannels, VelocityTarget
@@ -123,7 +124,8 @@ class GuardWorld:
     autopilot: str
     kind: Any
     has_receiver: bool
-    disengage: DisengageSettings
+    on_fault: OnFault
+    then: OnFault
     engage_channel: int | None
     clock: FakeClock = field(default_factory=FakeClock)
     serial: int = 0
@@ -166,7 +168,7 @@ class GuardWorld:
         self.others_due_ns = self.shown_ns = 0
 
     def _settings(self, meaning: ActionMeaning) -> FlightSettings:
-        free = LimitSettings(stick_slew_per_s=0.0, accel_mps2=1e6)
+        free = replace(limits_of(self.kind), change_per_s=(math.inf,) * 4)
         return FlightSettings(
             meaning=meaning,
             stick_period_ns=STEP_NS,
@@ -174,14 +176,15 @@ class GuardWorld:
             freshness=FreshnessLimits(
                 state_ns=LIMIT_NS, velocity_ns=LIMIT_NS, feature_ns=2 * LIMIT_NS, chunk_ns=LIMIT_NS
             ),
-            smoothing=Smoothing(limits=free.of(self.kind), tau_s=0.0),
+            smoothing=Smoothing(limits=free, tau_s=0.0),
             envelope=EnvelopeLimits(),
             watches_home_height=False,
             watches_position=False,
             engagement=engagement_settings(
                 modes=(self.mode,),
                 is_setpoint=self.kind != "sticks",
-                disengage=replace(self.disengage, is_setpoint=self.kind != "sticks"),
+                on_fault=self.on_fault,
+                then=self.then,
                 engage_channel=self.engage_channel,
             ),
         )

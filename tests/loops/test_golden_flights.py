@@ -15,7 +15,9 @@ from mavbridge.commands.replay import CLOCK_TOLERANCE, ENGINE_TOLERANCE
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
+from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.policies import load_configured_policy
+from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PolicyComparison,
@@ -24,7 +26,6 @@ from mavbridge.simulation.replay.compare import (
     other_traces,
 )
 from mavbridge.simulation.replay.guard import (
-    chunk_of,
     recorded_plan,
     replay_other,
 )
@@ -88,7 +89,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
     assert compared.missing == {}
     assert compared.inputs_differ == {}
     chunks = {
-        pair.recorded.serial: chunk_of(pair.replayed, source.contract)
+        pair.recorded.serial: chunk_of(pair.replayed, action_frame(source.contract))
         for pair in pairs
         if pair.replayed is not None
     }
@@ -110,7 +111,8 @@ def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     source, steps = golden(name), through_gate(name)
-    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+    frame = action_frame(source.contract)
+    chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
 
     traces = other_traces(steps, replay_other(steps, recorded_plan(source).guard, chunks))
 
@@ -121,7 +123,8 @@ def test_another_low_pass_moves_the_sticks() -> None:
     source, steps = golden("numpy_px4"), through_gate("numpy_px4")
     limits = replace(source.config.limits, tau=0.2)
     config = replace(source.config, limits=limits)
-    chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
+    frame = action_frame(source.contract)
+    chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
 
     settings = recorded_plan(replace(source, config=config)).guard
     traces = other_traces(steps, replay_other(steps, settings, chunks))

@@ -9,16 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.fakes import ListSink, level_telemetry, samples_of
+from helpers.fakes import ListSink
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.telemetry_cache import TelemetryCache
-from mavbridge.guard.wire import Samples
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation import flight as simulation
 from mavbridge.simulation.clock import SteppedClock
@@ -210,17 +206,3 @@ def test_every_kind_of_action_is_repeated_bit_for_bit(
 ) -> None:
     compared = flown_and_repeated(monkeypatch, attentive(**changes), autopilot=autopilot)
     assert_equal(compared)
-
-
-def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:
-    """Attitudes of one batch are all remembered: a replay does not know what came together."""
-    view = TelemetryCache(
-        history=SentHistory(length=4, dt_s=0.05),
-        sink=ListSink(),
-        state_frame="ned_frd",
-        freshness=Freshness(attitude_ns=NS_PER_S, velocity_ns=NS_PER_S),
-        keeps_past=True,
-    )
-    known = [level_telemetry(at_ns) for at_ns in (10, 20, 30)]
-    view.receive(Samples(tuple(sample for each in known for sample in samples_of(each))))
-    assert view.take_past(30) == known

@@ -12,7 +12,6 @@ from helpers.guard_machine import FLIGHT_MODES, GRACE_NS, LIMIT_NS, MS, STEP_NS,
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.switch import DWELL_NS
 from mavbridge.core.vehicle import Sticks
-from mavbridge.guard.sequences import DisengageSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 ENDINGS = st.sampled_from(("auto", "release", "hold", "land", "rtl"))
@@ -37,9 +36,8 @@ class GuardMachine(RuleBasedStateMachine):
         then=ENDINGS,
         engage_channel=st.sampled_from((None, None, 7)),
     )
-    def begin(self, combination: tuple[str, str], on_fault: Any, then: Any, **chosen: Any) -> None:
-        departure = DisengageSettings(on_fault=on_fault, then=then)
-        self.world = GuardWorld(*combination, disengage=departure, **chosen)
+    def begin(self, combination: tuple[str, str], **chosen: Any) -> None:
+        self.world = GuardWorld(*combination, **chosen)
         self.has_act = False
         """An explicit act has come that no flight has used up."""
         self.must_end = False
@@ -214,13 +212,13 @@ class GuardMachine(RuleBasedStateMachine):
 
     @rule()
     def obey(self) -> None:
-        if (asked := self.world.outputs[-1].mode) is not None:
+        if (asked := self.world.outputs[-1].actions.mode) is not None:
             self.world.vehicle.mode = asked
         self.step()
 
     @rule(is_refusing=st.booleans())
     def answer(self, is_refusing: bool) -> None:
-        self.world.refused_mode = self.world.outputs[-1].mode if is_refusing else None
+        self.world.refused_mode = self.world.outputs[-1].actions.mode if is_refusing else None
         self.step()
 
     @rule(armed=st.booleans())

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from helpers.guard_facts import stick_smoothing
+from helpers.guard_facts import limits_of, stick_smoothing
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import NEUTRAL, AttitudeThrust, Sticks
-from mavbridge.guard.limits import ActionSmoother, LimitSettings, Smoothing
+from mavbridge.guard.limits import ActionSmoother, Smoothing
 
 SLEW_PER_S = 8.0
 SETTINGS = stick_smoothing(max_slew_per_s=SLEW_PER_S, tau_s=0.05)
@@ -115,7 +115,7 @@ def test_sticks_stay_in_range_and_under_the_slew_limit(
 def test_rounding_carries_no_action_beyond_its_limits(
     wanted: list[tuple[float, float, float, float]], gaps_ns: list[int], tau_s: float
 ) -> None:
-    limits = LimitSettings(stick_slew_per_s=0.0).of("attitude")
+    limits = limits_of("attitude")
     start = AttitudeThrust(0.0, 0.0, 0.0, 0.0)
     smoother, now_ns = ActionSmoother(Smoothing(limits=limits, tau_s=tau_s), start), 0
     for raw, gap_ns in zip(wanted, gaps_ns, strict=False):
@@ -156,8 +156,7 @@ def test_a_reset_forgets_the_flight_before_and_the_time_since() -> None:
 
 
 def test_the_longest_step_is_15_periods_of_100_hz_unless_said_otherwise() -> None:
-    limits = LimitSettings(stick_slew_per_s=1.0).of("sticks")
-    smoother = ActionSmoother(Smoothing(limits=limits, tau_s=0.0), NEUTRAL)
+    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=1.0), NEUTRAL)
     smoother.step(NEUTRAL, 0)
     after_stall = smoother.step(Sticks(1.0, 0.0, 0.0, 0.0), NS_PER_S).smoothed
     assert after_stall.throttle == pytest.approx(0.15)

@@ -16,7 +16,7 @@ from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.provenance import versions
-from mavbridge.core.realtime import settle_guard, settle_thread, usable_cores
+from mavbridge.core.realtime import settle_guard, usable_cores
 
 PROC, SYS = Path("/proc"), Path("/sys")
 _CORES = 2
@@ -34,7 +34,7 @@ def computer_rows(rates: Rates) -> Iterator[CheckRow]:
     yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
     try:  # in a process of its own, so that this one is not affected
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            refused = pool.submit(_refused_rights, rates).result()
+            refused = pool.submit(settle_guard, realtime=rates.realtime).result() or ""
     except (OSError, BrokenProcessPool) as error:
         refused = f"the rights of the guard could not be tried: {error}"
     yield _row(
@@ -43,14 +43,6 @@ def computer_rows(rates: Rates) -> Iterator[CheckRow]:
         "SCHED_FIFO and locked memory" if rates.realtime else "locked memory",
         refused,
     )
-
-
-def _refused_rights(rates: Rates) -> str:
-    """Request the guard's rights; return those that this system refuses, empty if none."""
-    refusals = [settle_guard(realtime=rates.realtime, cpu=rates.guard_cpu)]
-    cpus = (rates.action_cpu, rates.vision_cpu)
-    refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus]
-    return "; ".join(filter(None, refusals))
 
 
 @dataclass(frozen=True, kw_only=True)

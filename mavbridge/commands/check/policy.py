@@ -153,7 +153,7 @@ def _run_at_rates(
     plan: FlightPlan, runner: PolicyRunner, clock: Clock, timing_s: float
 ) -> list[Pace]:
     """Compute chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
-    contract, rates, loops = runner.contract, plan.config.rates, plan.loops
+    contract, loops = runner.contract, plan.loops
     images, state, history = dummy_sample(contract)
     encoded = encode_all(runner, images)
     one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
@@ -163,13 +163,13 @@ def _run_at_rates(
             runner.encode(image, camera)
 
     chunks = Pace(name="chunks", asked_hz=loops.action_hz)
-    pictures = Pace(name="images", asked_hz=min((loops.max_vision_hz, *contract.camera_rates_hz)))
+    pictures = Pace(name="images", asked_hz=min((loops.vision_hz, *contract.camera_rates_hz)))
     workers = []
-    for pace, call, realtime, cpu in (
-        (chunks, lambda: runner.act(encoded, state, history), rates.realtime, rates.action_cpu),
-        (pictures, encode, False, rates.vision_cpu),
+    for pace, call, is_realtime in (
+        (chunks, lambda: runner.act(encoded, state, history), plan.config.rates.realtime),
+        (pictures, encode, False),
     ):
-        settle = partial(settle_thread, realtime=realtime, cpu=cpu)
+        settle: Callable[[], object] = settle_thread if is_realtime else lambda: None
         run = partial(pace.run, call=call, clock=clock, duration_s=timing_s, settle=settle)
         workers.append(Worker(f"mavbridge-check-{pace.name}", run))
     for worker in workers:

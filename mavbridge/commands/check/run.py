@@ -93,12 +93,12 @@ def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeed
             return []
         contract = Contract()
         names, sources = config.camera.sources, config.camera.sources
-        _, most_hz = config.rates.visual_limits_hz
+        most_hz = config.rates.visual_rate
         max_age_s = contract.max_feature_age_s
     else:
         contract = plan.contract
         names, sources = contract.cameras, config.camera.sources_of(contract.cameras)
-        most_hz = plan.loops.max_vision_hz
+        most_hz = plan.loops.vision_hz
         max_age_s = plan.start_limits.feature_ns / NS_PER_S
     rates_hz = contract.camera_rates_hz or (most_hz,) * len(sources)
     return [

@@ -224,7 +224,7 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Fl
     plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
-        meter = FlightMeter(plan, runner, clock=clock, guard_pid=guard.process.pid)
+        meter = FlightMeter(plan, runner, clock=clock, guard_pid=guard.pid)
         fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(meter,), guard=guard)
     if meter.release_reason is not None:
         raise PeerError(f"the policy lost the sticks: {meter.release_reason}")

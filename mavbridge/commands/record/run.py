@@ -40,7 +40,6 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import guard_settings
-from mavbridge.flight.state import Freshness
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest
@@ -131,17 +130,11 @@ class _Session:
             report=self._screen.show_message,
         )
         sink = FanOut((self._screen, self._episodes, *viewer))
-        flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).guard
-        self._view = PilotView(
-            sink=sink,
-            freshness=Freshness(
-                attitude_ns=flight.freshness.state_ns, velocity_ns=flight.freshness.velocity_ns
-            ),
-            samples=self._guard.samples,
-        )
+        plan = plan_flight(pilot_flight(config), CONTRACT, is_dual=True)
+        self._view = PilotView(plan, sink=sink, samples=self._guard.samples)
         self._images = FeatureCache()
         self._vision = self._vision_loop(camera, sink)
-        self._guard.send(flight)
+        self._guard.send(plan.guard)
 
     def _open_camera(self, console: Console) -> Camera:
         wanted = self._config.camera
@@ -159,14 +152,13 @@ class _Session:
 
     def _vision_loop(self, camera: Camera, sink: TickSink) -> VisionLoop:
         """Return a loop that encodes nothing, but paces, stamps and judges the images."""
-        frame_ns = period_ns(self._config.visual_rate)
         return VisionLoop(
             camera=camera,
-            encode=lambda _image: NOTHING.copy(),
+            encode=lambda _image, _camera: NOTHING.copy(),
             cache=self._images,
             sink=sink,
             clock=self._clock,
-            period_ns=lambda: frame_ns,
+            period_ns=period_ns(self._config.visual_rate),
             encoder_lock=threading.Lock(),
             image_watch=ImageWatch(
                 max_frozen_s=self._config.camera.max_frozen_image,

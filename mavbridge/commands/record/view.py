@@ -12,8 +12,7 @@ from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import ForwardedPacket, Packet, Sticks
-from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import Freshness
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort
 from mavbridge.mavlink.codec.frames import frame_at
@@ -37,15 +36,8 @@ class PilotView(TelemetryCache):
     """``TelemetryCache`` that passes its ticks on as the pilot's, logs the vehicle's packets, and
     counts those with sticks."""
 
-    def __init__(self, *, sink: TickSink, freshness: Freshness, samples: SocketPort) -> None:
-        super().__init__(
-            history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
-            sink=self,
-            state_frame=CONTRACT.state_frame,
-            freshness=freshness,
-            samples=samples,
-            watch_packets=self._watch,
-        )
+    def __init__(self, plan: FlightPlan, *, sink: TickSink, samples: SocketPort) -> None:
+        super().__init__(plan, sink=self, samples=samples, watch_packets=self._watch)
         self._pilot_sink = sink
         self._log: PacketPipe | None = None
         self._log_lock = threading.Lock()

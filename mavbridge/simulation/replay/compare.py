@@ -188,7 +188,7 @@ def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:
 
 def other_traces(steps: Sequence[GuardStep], outputs: Iterable[GuardOutput]) -> StickTraces:
     """Return the sticks from other chunks or other settings."""
-    return _traces(steps, [output.trace for output in outputs])
+    return _traces(steps, [output.tick.trace for output in outputs])
 
 
 def _traces(steps: Sequence[GuardStep], traces: Sequence[ActionTrace | None]) -> StickTraces:

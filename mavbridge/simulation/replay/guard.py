@@ -18,7 +18,7 @@ from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import FlightPlan, plan_flight
-from mavbridge.flight.policy_loop import make_chunk
+from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.settings import link_settings
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
@@ -31,7 +31,6 @@ from mavbridge.mavlink.transport.sockets import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
-from policy.contract import Contract
 
 PREPARE_NS = 10 * NS_PER_MS
 """Longest time between two polls of the link, as while no policy is loaded."""
@@ -56,20 +55,6 @@ class GuardStep:
     """Chunk that the guard got in this pass."""
     act: OperatorCommand | None
     stop: EndRequest | None
-
-
-def chunk_of(solve: Solve, contract: Contract) -> Chunk:
-    """Return the chunk that the policy loop makes of a solve."""
-    return make_chunk(
-        solve.serial,
-        solve.state,
-        action_frame(contract).to_guard(solve.actions[0]),
-        image_ns=solve.image_ns,
-        computed_ns=solve.computed_ns,
-        first_ns=solve.first_ns,
-        step_ns=solve.step_ns,
-        reset_ns=solve.reset_ns,
-    )
 
 
 def recorded_plan(source: ReplaySource) -> FlightPlan:
@@ -162,14 +147,14 @@ def _arrivals(
     """
     config = source.config
     is_called = not (config.arm or config.engage_channel or config.engage_on_arm)
-    solves = iter(source.solves)
+    frame, solves = action_frame(source.contract), iter(source.solves)
     waiting = next(solves, None)
     before: Tick | None = None
     for tick in source.ticks:
         newest: Solve | None = None
         while waiting is not None and _is_seen(waiting, tick):
             newest, waiting = waiting, next(solves, None)
-        chunk = None if newest is None else chunk_of(newest, source.contract)
+        chunk = None if newest is None else chunk_of(newest, frame)
         yield tick, chunk, _act(before, tick, is_called=is_called), _stop(before, tick)
         before = tick
 

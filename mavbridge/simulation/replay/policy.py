@@ -22,7 +22,7 @@ from mavbridge.core.vehicle import Sample, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.state import Freshness, StateReader, observation_ages_ns
+from mavbridge.flight.state import StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
@@ -180,12 +180,7 @@ class _News:
                 self._samples.append(new)
                 self._telemetry.append(decoder.telemetry)
         self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
-        limits = recorded_plan(source).start_limits
-        self._reader = StateReader(
-            source.contract,
-            freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
-            goal_ned_m=source.config.goal_ned_m,
-        )
+        self._reader = StateReader(recorded_plan(source))
         self._next = 0
         self._ticks = source.ticks
         self._next_tick = 0
@@ -249,13 +244,12 @@ def _stamps_ns(now: Telemetry) -> list[int]:
 def _guard_tick(tick: Tick) -> GuardTick:
     """Rebuild the guard's report that became this tick."""
     return GuardTick(
-        index=tick.index,
+        slot=tick.index if tick.is_slot else None,
         due_ns=tick.due_ns,
         woke_ns=tick.woke_ns,
         decided_ns=tick.decided_ns or tick.woke_ns,
         sent_ns=tick.sent_ns,
         missed_slots=tick.missed_slots,
-        is_slot=tick.is_slot,
         is_coasting=tick.is_coasting,
         chunk_serial=tick.chunk_serial,
         trace=tick.trace,

@@ -25,5 +25,5 @@ def test_a_policy_that_plays_its_chunks_is_solved_twice_for_each(
 
 
 def test_a_slow_single_rate_policy_finds_an_image_that_has_just_come() -> None:
-    assert Rates(rate=1.0).loops(is_dual=False).max_vision_hz == 30.0
-    assert Rates(rate=100.0).loops(is_dual=False).max_vision_hz == 100.0
+    assert Rates(rate=1.0).loops(is_dual=False).vision_hz == 30.0
+    assert Rates(rate=100.0).loops(is_dual=False).vision_hz == 100.0

@@ -44,19 +44,19 @@ def test_a_setting_on_the_command_line_wins_over_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "own.toml"
-    path.write_text("[limits]\nattitude-age = 0.09\nslew = 3\n[scheduling]\nguard_cpu = 1\n")
+    path.write_text("[limits]\nattitude-age = 0.09\nslew = 3\n[scheduling]\nrealtime = true\n")
     given = (
         "limits.attitude_age=0.05",
         "scheduling.realtime=false",
         "link.accept_risk=slow-serial",
     )
-    more = ("link.accept-risk=endless-override", "rates.visual=auto:5:20", "network.engine=torch")
+    more = ("link.accept-risk=endless-override", "rates.visual=20", "network.engine=torch")
     words = [word for text in (*given, *more) for word in ("--set-config", text)]
     config = flown(monkeypatch, "--config", str(path), *words)
     assert (config.limits.max_attitude_age, config.limits.max_slew) == (0.05, 3.0)
-    assert (config.rates.realtime, config.rates.guard_cpu) == (False, 1)
+    assert config.rates.realtime is False
     assert config.link.accept_risk == ("slow-serial", "endless-override")
-    assert (config.rates.visual_rate, config.policy.engine) == ("auto:5:20", "torch")
+    assert (config.rates.visual_rate, config.policy.engine) == (20.0, "torch")
 
 
 @pytest.mark.parametrize(

@@ -26,12 +26,13 @@ def test_quantiles_are_nearest_rank_within_the_resolution(
         assert histogram.quantile_ns(fraction) == values[0], "exactly"
 
 
-def test_values_beyond_the_bins_keep_their_extremes_and_no_value_has_none() -> None:
+def test_extremes_are_kept_and_no_value_has_none() -> None:
     histogram = Histogram()
     assert (histogram.quantile_ns(0.5), histogram.percentiles_ms()) == (None, None)
     for value_ns in (-5, 2**50):
         histogram.add(value_ns)
     assert (histogram.min_ns, histogram.max_ns, histogram.quantile_ns(0.5)) == (-5, 2**50, 0)
+    assert histogram.quantile_ns(1.0) == 2**50
 
 
 def test_one_outlier_in_a_thousand_shows_in_p999_and_max_only() -> None:

@@ -31,7 +31,7 @@ GUARD = """
 import os, sys
 from mavbridge.core.realtime import settle_guard
 {before}
-print(settle_guard(realtime=True, cpu=None))
+print(settle_guard(realtime=True))
 policy = os.sched_getscheduler(0)
 is_fifo = policy & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 print(is_fifo, bool(policy & os.SCHED_RESET_ON_FORK), os.sched_getparam(0).sched_priority)
@@ -105,12 +105,11 @@ def test_a_guard_without_rights_says_how_to_allow_what_it_lacks() -> None:
 def test_where_there_is_no_fifo_the_refusal_names_the_system(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("SCHED_RESET_ON_FORK", "sched_setaffinity", "sched_getaffinity"):
+    for name in ("SCHED_RESET_ON_FORK", "sched_getaffinity"):
         monkeypatch.delattr(os, name, raising=False)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert "Darwin has no SCHED_FIFO" in (settle_thread(realtime=True, cpu=None) or "")
-    assert "CPU 3: Darwin" in (settle_thread(realtime=False, cpu=3) or "")
+    assert "Darwin has no SCHED_FIFO" in (settle_thread() or "")
 
 
 @pytest.mark.parametrize(("system", "is_refused"), [("Windows", True), ("Linux", False)])
@@ -132,15 +131,9 @@ def test_the_action_loop_is_below_the_guard_and_never_takes_the_only_cpu(
     for cpus in ({0}, {0, 1}):
         assert asked == []
         monkeypatch.setattr(os, "sched_getaffinity", lambda _, cpus=cpus: cpus)
-        assert settle_thread(realtime=True, cpu=None) is None
+        assert settle_thread() is None
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     assert asked == [(0, policy, os.sched_param(ACTION_FIFO_PRIORITY))]
     assert ACTION_FIFO_PRIORITY < GUARD_FIFO_PRIORITY
     monkeypatch.setattr(os, "sched_setscheduler", Mock(side_effect=PermissionError))
-    assert "ulimit" in (settle_thread(realtime=True, cpu=None) or "")
-
-
-@linux
-def test_a_cpu_that_does_not_exist_is_told() -> None:
-    assert settle_thread(realtime=False, cpu=None) is None
-    assert "CPU 4095" in (settle_thread(realtime=False, cpu=4095) or "")
+    assert "ulimit" in (settle_thread() or "")

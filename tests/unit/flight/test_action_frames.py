@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from helpers.factories import make_plan
 from mavbridge.core.vehicle import (
     Action,
     AttitudeThrust,
@@ -13,7 +14,7 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.flight.state import Freshness, build_state
+from mavbridge.flight.state import StateReader
 from policy.contract import RATE, VELOCITY, ActionKind, Contract, StateFrame, VelocityFrame
 
 FOUR = np.array([[0.5, 1.0, 2.0, 3.0], [0.25, -4.0, 5.0, -6.0]], np.float32)
@@ -51,8 +52,7 @@ def test_an_action_that_repeats_the_state_asks_for_the_motion_of_now(
         velocity_ned_mps=Reading(0, (1.0, 2.0, -3.0)),
         specific_force_body_mps2=Reading(0, (0.0, 0.0, -9.8)),
     )
-    fresh = Freshness(attitude_ns=1, velocity_ns=1)
-    state = build_state(telemetry, 0, frame=state_frame, freshness=fresh)
+    state = StateReader(make_plan(Contract(state_frame=state_frame))).motion(telemetry, 0)
     values = state.values  # type: ignore[union-attr]
     velocity = np.array([[*values[VELOCITY], values[RATE][2]]], np.float32)
     frame = action_frame(Contract(action="velocity", state_frame=state_frame))

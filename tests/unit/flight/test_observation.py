@@ -51,7 +51,7 @@ def felt(ago_ms: float) -> VehicleState:
 
 
 def source(
-    contract: Contract, *caches: FeatureCache, past: Sequence[float] = (), span_ms: int = 200
+    contract: Contract, *caches: FeatureCache, past: Sequence[float] = ()
 ) -> ObservationSource:
     runner = PolicyRunner(
         contract=contract,
@@ -61,15 +61,9 @@ def source(
         encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
         act=lambda e, s, h: e,
     )
-    looks = ObservationSource(
-        contract,
-        caches=caches,
-        join=runner.join,
-        max_feature_age_ns=300 * MS,
-        states_span_ns=span_ms * MS,
-    )
+    looks = ObservationSource(contract, caches=caches, join=runner.join, max_age_ns=300 * MS)
     for ago_ms in past:
-        looks.remember(felt(ago_ms))
+        looks.push(felt(ago_ms))
     return looks
 
 
@@ -94,7 +88,7 @@ def test_past_features_are_the_nearest_to_each_step_before_the_newest() -> None:
     assert found.encoded[0, :, 0].tolist() == [221.5, 119, 20]
     assert found.states.shape == (1, 3, 13)
     assert found.states[0, :, 0].tolist() == [201, 99, 0]
-    assert found.image_ns == found.feature.captured_ns == NOW_NS - 20 * MS
+    assert found.image_ns == found.captured_ns == NOW_NS - 20 * MS
 
 
 def test_the_oldest_is_repeated_where_there_is_no_older_one() -> None:
@@ -168,7 +162,7 @@ def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:
     found = observed(source(TWO_CAMERAS, *caches).observe(felt(0), NOW_NS))
     assert found.image_ns == NOW_NS - 90 * MS
     assert found.encoded.tolist() == [[20, 90]]
-    assert found.feature.captured_ns == NOW_NS - 20 * MS
+    assert found.captured_ns == NOW_NS - 20 * MS
 
 
 def test_histories_are_bounded() -> None:
@@ -177,13 +171,12 @@ def test_histories_are_bounded() -> None:
     cache = FeatureCache(span_ns=60_000 * MS)
     for ago_ms in past:
         cache.publish(seen(ago_ms))
-    looks = source(contract, cache, past=past, span_ms=60_000)
+    looks = source(contract, cache, past=past)
     rows = observed(looks.observe(felt(0), NOW_NS)).states[0]
     assert rows[0, 0] == MAX_STATES
     assert cache.nearest(seen(0), before_ns=60_000 * MS).value[0, 0] == MAX_PAST
-    short = source(contract, cache, past=(*past, 50), span_ms=100)  # 50 is late
-    rows = observed(short.observe(felt(0), NOW_NS)).states[0]
-    assert rows[0, 0] == 101
+    short = source(THREE_STEPS, cache, past=(*past, 50))  # 50 is late
+    assert len(short._states) == 201
 
 
 def test_ages_of_observations() -> None:

@@ -7,27 +7,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.factories import make_guard_tick
+from helpers.factories import make_guard_tick, make_plan
 from helpers.fakes import START_NS, FakeClock, ListSink, level_telemetry, samples_of
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
 from mavbridge.core.vehicle import Reading, Sample, Telemetry, Velocity
-from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.forward_state import ForwardState
-from mavbridge.flight.history import SentHistory
-from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
-from mavbridge.flight.state import Freshness, ObservationSource, StateReader
+from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import NoChunk, Samples
 from policy.contract import Contract
+from policy.protocol import PolicyRunner
 
 MS = NS_PER_MS
-STICKS_FRAME = ActionFrame()
-FRESH = Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS)
 NO_ATTITUDE = because(Code.NO_READING, quantity="attitude")
 FROZEN = because(Code.IMAGE_FROZEN, age_s=0.6)
 
@@ -38,42 +34,33 @@ class Rig:
     def __init__(
         self,
         chunk: Callable[[], FloatArray] | None = None,
-        frame: ActionFrame = STICKS_FRAME,
         period_ms: int = 10,
-        forward: ForwardState | None = None,
-        prefix_len: int = 0,
+        **contract: Any,
     ) -> None:
+        meaning = Contract(**{"horizon": 3, "chunk_dt_s": 0.05, "history_len": 2} | contract)
+        plan = make_plan(meaning, rates=Rates(action_rate=1000 / period_ms))
         self.clock, self.cache = FakeClock(), FeatureCache()
-        history = SentHistory(length=2, dt_s=0.05, frame=frame)
-        self.view = TelemetryCache(
-            history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
-        )
+        self.view = TelemetryCache(plan, sink=ListSink())
         self.sent: list[Chunk | NoChunk] = []
         self.solves = self.resets = 0
         self.north_mps, self.solve_ns, self.given = 0.0, 3 * MS, (np.zeros(0, np.float32),) * 3
         self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
-        self.loop = PolicyLoop(
-            clock=self.clock,
-            view=self.view,
-            reader=StateReader(Contract(), freshness=FRESH),
-            observations=ObservationSource(
-                Contract(),
-                caches=(self.cache,),
-                join=lambda encoded: encoded[0][0],
-                max_feature_age_ns=300 * MS,
-            ),
-            history=history,
+        runner = PolicyRunner(
+            contract=meaning,
+            name="",
+            engine="",
+            dual_rate=True,
+            encode=lambda rgb, camera=0: np.zeros((1, 8), np.float32),
             act=self._act,
             reset=self._reset,
+        )
+        self.loop = PolicyLoop(
+            plan,
+            runner,
+            clock=self.clock,
+            view=self.view,
+            caches=[self.cache],
             send=self.sent.append,
-            settings=PolicySettings(
-                action_frame=frame,
-                chunk_dt_s=0.05,
-                max_frozen_ns=500 * MS,
-                forward=forward,
-                prefix_len=prefix_len,
-                period_ns=period_ms * MS,
-            ),
         )
 
     def _act(self, *inputs: Any) -> FloatArray:
@@ -139,8 +126,8 @@ def test_a_chunk_carries_the_moments_that_it_came_from(velocity_ms: int, force_m
 
 
 def test_actions_reach_the_guard_in_its_own_kind_and_axes() -> None:
-    frame = action_frame(Contract(action="velocity", state_frame="enu_flu"))
-    rig = Rig(lambda: np.array([[[1, 2, 3, 0.5]]], np.float32), frame).measure().see()
+    chunk = np.array([[[1, 2, 3, 0.5]]], np.float32)
+    rig = Rig(lambda: chunk, action="velocity", state_frame="enu_flu").measure().see()
     rig.loop.step()
     (chunk,) = rig.sent
     assert isinstance(chunk, Chunk)
@@ -154,7 +141,7 @@ def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
     north_mps: float,
 ) -> None:
     pitch = np.tile(np.array([0.0, 0.0, 0.8, 0.0], np.float32), (1, 16, 1))
-    rig = Rig(lambda: pitch, period_ms=200, forward=ForwardState(Contract())).measure().see()
+    rig = Rig(lambda: pitch, 200, horizon=16, state_time="execution").measure().see()
     rig.north_mps, rig.solve_ns = north_mps, 200 * MS
     rig.loop.step()  # not flying yet: as measured
     rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
@@ -175,7 +162,7 @@ def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
 def test_the_prefix_holds_what_flies_until_the_chunk_takes_over() -> None:
     rising = np.zeros((1, 16, 4), np.float32)
     rising[0, :, 0] = np.arange(16) / 100
-    rig = Rig(lambda: rising, period_ms=100, prefix_len=6).measure().see()
+    rig = Rig(lambda: rising, 100, horizon=16, prefix_len=6).measure().see()
     rig.solve_ns = 200 * MS
     rig.loop.step()
     _, _, history = rig.given
@@ -287,12 +274,10 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
 
 @pytest.mark.parametrize("failure", [RuntimeError, SystemExit, MemoryError])
 def test_a_policy_that_fails_is_told_to_the_guard_at_once(failure: type[BaseException]) -> None:
-    rig = Rig().see().measure()
-
-    def fail(*_: object) -> FloatArray:
+    def fail() -> FloatArray:
         raise failure
 
-    rig.loop._act = fail
+    rig = Rig(fail).see().measure()
     rig.view.wait_for_attitude = lambda *_, **__: True  # type: ignore[method-assign]
     with pytest.raises(failure):
         rig.loop.run(threading.Event())

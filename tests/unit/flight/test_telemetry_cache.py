@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 import pytest
 from rich.console import Console
 
-from helpers.factories import make_state, make_trace
+from helpers.factories import make_plan, make_solve, make_trace
 from helpers.fakes import START_NS, ListSink, level_telemetry, samples_of, without
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import ForwardedPacket, Reading, Sticks, Telemetry
-from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.telemetry_cache import MAX_SOLVES, SolveInputs, TelemetryCache
+from mavbridge.flight.telemetry_cache import MAX_SOLVES, TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
@@ -29,17 +27,17 @@ from mavbridge.guard.wire import (
 )
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, ObserverDrops
+from policy.contract import Contract
 
 MS = NS_PER_MS
 STICKS = Sticks(0.2, 0.2, 0.2, 0.2)
 TICK = GuardTick(
-    index=4,
+    slot=4,
     due_ns=START_NS,
     woke_ns=START_NS,
     decided_ns=START_NS,
     sent_ns=START_NS + MS,
     missed_slots=1,
-    is_slot=True,
     is_coasting=True,
     chunk_serial=7,
     trace=make_trace(STICKS),
@@ -49,31 +47,20 @@ TICK = GuardTick(
 )
 WAIT = because(Code.NO_CHUNK)
 OFF = because(Code.OVERRIDE_SWITCH_OFF)
-NOBODY = replace(TICK, chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason=WAIT)
-LATER = replace(TICK, index=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
-SOLVE = SolveInputs(
-    serial=7,
-    state=make_state(START_NS - 5 * MS),
-    feature_frame_id=12,
-    feature_captured_ns=START_NS - 40 * MS,
-    computed_ns=START_NS - MS,
-    predict_ns=3 * MS,
+NOBODY = TICK._replace(chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason=WAIT)
+LATER = TICK._replace(slot=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
+SOLVE = make_solve(
+    7, frame_ids=((11,), (12,)), started_ns=START_NS - 4 * MS, computed_ns=START_NS - MS
 )
+CAPTURED_NS = START_NS - 40 * MS
 
 
 class Viewed:
     """A view, and the vehicle's samples for it."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, contract: Contract | None = None, **changes: Any) -> None:
         self.sink = ListSink()
-        self.history = SentHistory(length=2, dt_s=0.01)
-        self.view = TelemetryCache(
-            history=self.history,
-            sink=self.sink,
-            state_frame="ned_frd",
-            freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
-            **changes,
-        )
+        self.view = TelemetryCache(make_plan(contract), sink=self.sink, **changes)
 
     def samples(self, at_ns: int = START_NS, *, height_m: float = 3.0) -> Samples:
         position = Reading(at_ns, (0.0, 0.0, -height_m))
@@ -112,7 +99,7 @@ def test_samples_are_the_newest_telemetry() -> None:
 
 
 def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
-    view = Viewed(keeps_past=True).view
+    view = Viewed(Contract(observation_steps=2)).view
     first, second, third = (level_telemetry(START_NS + k * MS) for k in range(3))
     velocity = without(second, "ned_from_body_wxyz")
     view.receive(Samples(samples_of(first) + samples_of(velocity) + samples_of(third)))
@@ -132,15 +119,13 @@ def test_packets_go_to_the_recorder_alone() -> None:
 
 def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:
     viewed = Viewed()
-    viewed.view.remember(SOLVE)
+    viewed.view.remember(SOLVE, CAPTURED_NS)
     status = GuardStatus("ArduPilot", "ALT_HOLD", True, False, (1500,) * 8, STICKS)
-    viewed.receive(status, replace(TICK, index=3), TICK)
+    viewed.receive(status, TICK._replace(slot=3), TICK)
     tick = viewed.sink.ticks[1]
     assert tick.state is SOLVE.state
     assert (tick.feature_frame_id, tick.predict_ns) == (12, 3 * MS)
-    assert (tick.feature_captured_ns, tick.chunk_computed_ns) == (
-        *(SOLVE.feature_captured_ns, SOLVE.computed_ns),
-    )
+    assert (tick.feature_captured_ns, tick.chunk_computed_ns) == (CAPTURED_NS, SOLVE.computed_ns)
     assert (tick.index, tick.missed_slots, tick.is_slot, tick.is_coasting) == (4, 1, True, True)
     assert (tick.sent, tick.trace, tick.chunk_serial) == (STICKS, TICK.trace, 7)
     assert (tick.mode, tick.armed, tick.rc_sticks) == ("ALT_HOLD", True, STICKS)
@@ -150,8 +135,8 @@ def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:
 def test_a_tick_whose_chunk_is_no_longer_remembered_is_told_without_its_inputs() -> None:
     viewed = Viewed()
     for serial in range(7, 8 + MAX_SOLVES):
-        viewed.view.remember(SOLVE._replace(serial=serial))
-    viewed.receive(TICK, replace(TICK, chunk_serial=8))
+        viewed.view.remember(replace(SOLVE, serial=serial), CAPTURED_NS)
+    viewed.receive(TICK, TICK._replace(chunk_serial=8))
     forgotten, known = viewed.sink.ticks
     assert (forgotten.predict_ns, forgotten.feature_frame_id, forgotten.state) == (None,) * 3
     assert known.predict_ns == 3 * MS
@@ -162,7 +147,7 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     late_ms: int, is_fresh: bool
 ) -> None:
     viewed = Viewed()
-    viewed.receive(viewed.samples(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
+    viewed.receive(viewed.samples(), NOBODY._replace(sent_ns=START_NS + late_ms * MS))
     (tick,) = viewed.sink.ticks
     assert (tick.state is not None) is is_fresh
     assert tick.release_reason == WAIT
@@ -177,18 +162,18 @@ def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
 
 
 def test_history_follows_what_was_sent() -> None:
-    viewed = Viewed().receive(TICK)
+    viewed = Viewed(Contract(history_len=2, history_dt_s=0.01)).receive(TICK)
     at_ns = TICK.sent_ns + 20 * MS
-    assert viewed.history.resample(at_ns).tolist() == [[pytest.approx(STICKS)] * 2]
-    viewed.receive(replace(NOBODY, sent_ns=at_ns))
-    assert viewed.history.resample(at_ns + 10 * MS)[0, 1].tolist() == [0.0] * 4
+    assert viewed.view.history.resample(at_ns).tolist() == [[pytest.approx(STICKS)] * 2]
+    viewed.receive(NOBODY._replace(sent_ns=at_ns))
+    assert viewed.view.history.resample(at_ns + 10 * MS)[0, 1].tolist() == [0.0] * 4
 
 
 def test_flights_are_counted_and_the_phase_is_that_of_the_guard() -> None:
-    viewed = Viewed().receive(NOBODY, TICK, TICK, replace(NOBODY, phase=Phase.RELEASED), TICK)
+    viewed = Viewed().receive(NOBODY, TICK, TICK, NOBODY._replace(phase=Phase.RELEASED), TICK)
     assert viewed.view.flights == 2
     assert viewed.view.phase is Phase.FLYING
-    viewed.receive(replace(NOBODY, phase=Phase.RELEASING, reason=OFF))
+    viewed.receive(NOBODY._replace(phase=Phase.RELEASING, reason=OFF))
     assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, OFF)
 
 
@@ -251,10 +236,10 @@ def test_status_line_report_and_recording_count_the_missed_slots_of_the_flight_a
     timing = FlightTiming(action_hz=100.0, vision_hz=30.0, stick_hz=100.0)
     screen = FlightScreen(Console(), action_hz=100.0, vision_hz=30.0, readonly=False)
     viewed = Viewed()
-    for one in (NOBODY, TICK, LATER, replace(LATER, index=9, missed_slots=2), NOBODY, NOBODY):
+    for one in (NOBODY, TICK, LATER, LATER._replace(slot=9, missed_slots=2), NOBODY, NOBODY):
         viewed.receive(one)
-    leaving = replace(NOBODY, phase=Phase.LEAVING, sent=STICKS, missed_slots=10)
-    viewed.receive(leaving, leaving, TICK, replace(LATER, missed_slots=0))
+    leaving = NOBODY._replace(phase=Phase.LEAVING, sent=STICKS, missed_slots=10)
+    viewed.receive(leaving, leaving, TICK, LATER._replace(missed_slots=0))
     for tick in viewed.sink.ticks:
         timing.emit(tick)
         screen.emit(tick)

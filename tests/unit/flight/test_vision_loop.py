@@ -40,8 +40,8 @@ class StillCamera:
 
 def make_loop(clock, camera, *, cache=None, sink=None, lock=None, **changes):
     settings = {
-        "encode": lambda rgb: np.zeros((1, 8), np.float32),
-        "period_ns": lambda: FRAME_NS,
+        "encode": lambda rgb, camera: np.zeros((1, 8), np.float32),
+        "period_ns": FRAME_NS,
         "encoder_lock": lock or threading.Lock(),
     }
     return VisionLoop(
@@ -112,7 +112,7 @@ def test_without_a_watch_nothing_is_a_fault():
 
 def test_a_camera_faster_than_the_visual_rate_is_thinned():
     clock, sink = FakeClock(), ListSink()
-    loop = make_loop(clock, StillCamera(clock, SCENE), sink=sink, period_ns=lambda: 2 * FRAME_NS)
+    loop = make_loop(clock, StillCamera(clock, SCENE), sink=sink, period_ns=2 * FRAME_NS)
     for _ in range(100):
         loop.step()
     assert set(np.diff([vision.captured_ns for vision in sink.visions])) == {2 * FRAME_NS}
@@ -127,11 +127,11 @@ def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
         camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
         return make_loop(clock, camera, lock=lock, encode=encode)
 
-    def encode_second(rgb):
+    def encode_second(rgb, camera):
         seen.append((first.encoding_since_ns, second.encoding_since_ns))
         return np.zeros((1, 8), np.float32)
 
-    def encode_first(rgb):
+    def encode_first(rgb, camera):
         waiting.start()
         waiting.join(0.05)  # the other cannot end before this one has
         seen.append((first.encoding_since_ns, second.encoding_since_ns))

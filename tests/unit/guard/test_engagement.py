@@ -5,16 +5,15 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, flying
+from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, altered, flying
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.guard.sequences import DisengageSettings
-from mavbridge.guard.values import Actions, ControlSource, EndRequest, Outcome, Phase
+from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest, Outcome, Phase
 
 NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
 RELEASE = Actions(control=ControlSource.RELEASE)
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
-NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
+NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
 DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
 
@@ -28,7 +27,7 @@ def changed(before: str, after: str) -> Reason:
 
 def switched(us: int = 1000, **changes: Any) -> Stepped:
     return Stepped(
-        replace(AIRBORNE, rc_channels_us=(1500,) * 7 + (us,), **changes), engage_channel=8
+        altered(AIRBORNE, rc_channels_us=(1500,) * 7 + (us,), **changes), engage_channel=8
     )
 
 
@@ -39,13 +38,6 @@ def test_the_switch_engages_by_going_high_after_a_rest_and_releases_by_going_low
     assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == FLIES
     assert stepped.step(rc_channels_us=LOW) == RELEASE
     assert stepped.codes == (Code.ENGAGE_SWITCH_OFF,)
-
-
-def test_a_switch_that_was_never_high_needs_the_debounce_alone() -> None:
-    stepped = switched()
-    stepped.run(0.21)
-    assert set(stepped.run(0.2, rc_channels_us=HIGH)) == {NOTHING}
-    assert stepped.step() == FLIES
 
 
 @pytest.mark.parametrize(
@@ -64,7 +56,7 @@ def test_a_switch_that_was_never_high_needs_the_debounce_alone() -> None:
 def test_the_switch_engages_from_below_1200_to_above_1800(
     low_us: int, high_us: int, engages: bool
 ) -> None:
-    stepped = Stepped(replace(AIRBORNE, rc_channels_us=(low_us,)), engage_channel=1)
+    stepped = Stepped(altered(AIRBORNE, rc_channels_us=(low_us,)), engage_channel=1)
     stepped.run(0.3)
     stepped.run(0.3, rc_channels_us=(high_us,))
     assert (stepped.phase is Phase.FLYING) == engages
@@ -73,7 +65,7 @@ def test_the_switch_engages_from_below_1200_to_above_1800(
 @pytest.mark.parametrize("unused_us", [0, 799, 2201, 65535])
 @pytest.mark.parametrize("before", [LOW, HIGH])
 def test_a_gap_of_readings_is_no_rest(unused_us: int, before: tuple[int, ...]) -> None:
-    stepped = Stepped(replace(AIRBORNE, rc_channels_us=before), engage_channel=8)
+    stepped = Stepped(altered(AIRBORNE, rc_channels_us=before), engage_channel=8)
     stepped.run(3)
     assert set(stepped.run(3, rc_channels_us=(*HIGH[:7], unused_us))) == {NOTHING}
     assert set(stepped.run(1, rc_channels_us=HIGH)) == {NOTHING}
@@ -99,7 +91,7 @@ def test_a_dropout_that_puts_the_switch_low_is_no_act(seconds: float, is_flying:
         {"is_failsafe": True},
         {"is_receiver_sick": True},
         {"rc_channels_us": ()},
-        {"rc_channels_us": LOW, "channels_ns": 1},
+        {"rc_channels_us": LOW, "channels_arrived_ns": 1},
     ],
 )
 @pytest.mark.parametrize("again_s", [0.0, 0.3, 1.7])
@@ -109,7 +101,7 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     stepped = switched()
     stepped.run(3)
     stepped.run(0.6, **lost)
-    well = {"is_failsafe": False, "is_receiver_sick": False, "channels_ns": None}
+    well = {"is_failsafe": False, "is_receiver_sick": False, "channels_arrived_ns": None}
     stepped.run(again_s, rc_channels_us=LOW, **well)
     assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
     not_rested = because(Code.SWITCH_NOT_RESTED, channel=8, rest_s=1.8)
@@ -118,28 +110,11 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     assert FLIES in stepped.run(0.3, rc_channels_us=HIGH)
 
 
-def test_a_switch_that_bounces_is_no_act() -> None:
-    stepped = switched()
-    stepped.run(3)
-    for _ in range(20):
-        assert set(stepped.run(0.19, rc_channels_us=HIGH)) == {NOTHING}
-        stepped.step(rc_channels_us=(1500,) * 8)
-
-
 def test_the_dwell_counts_arrivals_and_not_the_time_that_an_old_value_stays() -> None:
-    stepped = switched(channels_ns=0)
+    stepped = switched(channels_arrived_ns=0)
     stepped.run(0.45)
     now_ns = stepped.facts.now_ns
-    assert set(stepped.run(0.45, rc_channels_us=HIGH, channels_ns=now_ns)) == {NOTHING}
-
-
-def test_a_switch_engages_once_each_time_it_goes_high() -> None:
-    stepped = switched()
-    stepped.run(0.3)
-    stepped.run(0.3, rc_channels_us=HIGH)
-    stepped.step(mode="LOITER")
-    stepped.run(0.1, is_released=True)
-    assert set(stepped.run(1, mode="ALT_HOLD")) == {NOTHING}
+    assert set(stepped.run(0.45, rc_channels_us=HIGH, channels_arrived_ns=now_ns)) == {NOTHING}
 
 
 def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
@@ -160,16 +135,17 @@ def test_engage_on_arm_counts_the_first_arming_alone() -> None:
 
 @pytest.mark.parametrize("found_ns", [0, NS_PER_S])
 def test_a_vehicle_that_is_found_armed_was_not_armed_for_us(found_ns: int) -> None:
-    stepped = Stepped(replace(ON_GROUND, is_connected=False), engage_on_arm=True)
+    facts = replace(ON_GROUND, link=replace(ON_GROUND.link, status=None), status=NOT_FOUND)
+    stepped = Stepped(facts, engage_on_arm=True)
     stepped.run(found_ns / NS_PER_S)
-    assert set(stepped.run(1, is_connected=True, armed=True)) == {NOTHING}
+    assert set(stepped.run(1, armed=True)) == {NOTHING}
 
 
 # --- what is remembered from one flight to the next
 
 
 def test_the_safe_mode_of_the_last_flight_is_the_pilots_in_the_next_one() -> None:
-    stepped = flying(disengage=DisengageSettings(on_fault="hold"))
+    stepped = flying(on_fault="hold")
     stepped.step(**FAULT)
     stepped.run(0.2, mode="BRAKE")
     stepped.run(1.5)
@@ -181,7 +157,7 @@ def test_the_safe_mode_of_the_last_flight_is_the_pilots_in_the_next_one() -> Non
 
 def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> None:
     rebooted = {"interruption": because(Code.REBOOTED), "interruptions": 1}
-    stepped = Stepped(replace(ON_GROUND, **rebooted), arm=True)
+    stepped = Stepped(altered(ON_GROUND, **rebooted), arm=True)
     stepped.run(0.1, echo_confirmed=True)
     stepped.step(armed=True)
     assert stepped.step() == FLIES
@@ -203,23 +179,6 @@ def test_the_duration_counts_from_the_first_engagement_on_and_through_takeovers(
     assert stepped.phase is Phase.ENDED
 
 
-def test_the_first_stop_is_the_one_that_counts() -> None:
-    stepped = flying(disengage=DisengageSettings(on_fault="rtl", then="land"))
-    stepped.engagement.stop(EndRequest(because(Code.DURATION)))
-    assert stepped.step(stop=DEATH).mode == "LAND"
-    assert stepped.codes == (Code.DURATION,)
-
-
-@pytest.mark.parametrize("stop_at", ["flying", "leaving"])
-def test_a_stop_ends_the_guard_after_the_way_out(stop_at: str) -> None:
-    stepped = flying()
-    if stop_at == "leaving":
-        stepped.step(**FAULT)
-    stepped.step(stop=DEATH)
-    stepped.run(0.2, is_released=True)
-    assert stepped.phase is Phase.ENDED
-
-
 # --- what is told
 
 
@@ -234,22 +193,15 @@ def test_the_reason_of_the_way_out_and_who_ended_it_are_both_told() -> None:
     )
 
 
-def test_after_a_takeover_its_reason_stays() -> None:
-    stepped = flying()
-    stepped.step(mode="LOITER")
-    stepped.run(0.2, is_released=True, chunk_problem=because(Code.NO_IMAGE))
-    assert stepped.engagement.reason == changed("ALT_HOLD", "LOITER")
-
-
 def test_a_wrong_mode_is_told_with_the_right_ones() -> None:
-    stepped = Stepped(replace(AIRBORNE, mode="LOITER"))
+    stepped = Stepped(altered(AIRBORNE, mode="LOITER"))
     stepped.step("engage")
     wrong = because(Code.WRONG_MODE, mode="LOITER", allowed="ALT_HOLD or ALTCTL")
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=wrong)
 
 
 def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
-    stepped = Stepped(replace(ON_GROUND, chunk_problem=because(Code.NO_IMAGE)), arm=True)
+    stepped = Stepped(altered(ON_GROUND, chunk_problem=because(Code.NO_IMAGE)), arm=True)
     stepped.run(92, is_released=True)
     assert stepped.phase is Phase.ENDED
     assert stepped.engagement.failure == because(
@@ -274,7 +226,7 @@ def test_what_was_not_confirmed_is_told_once() -> None:
 
 
 def test_each_flight_and_how_it_ended_is_counted() -> None:
-    stepped = flying(replace(AIRBORNE, is_landed=None))
+    stepped = flying(altered(AIRBORNE, is_landed=None))
     assert stepped.engagement.outcome == Outcome(flights=1)
     stepped.step(is_landed=True)
     stepped.step(is_landed=False)
@@ -318,7 +270,7 @@ def test_how_a_flight_ended_is_told_by_its_code(change: dict[str, Any], end: str
 
 
 def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
-    stepped = Stepped(replace(AIRBORNE, armed=False, mode="RTL"), readonly=True)
+    stepped = Stepped(altered(AIRBORNE, armed=False, mode="RTL"), readonly=True)
     assert set(stepped.run(1)) == {FLIES}
     assert stepped.step(chunk_problem=because(Code.NO_IMAGE)) == NOTHING
     assert (stepped.phase, stepped.codes) == (Phase.WAITING, (Code.NO_IMAGE,))

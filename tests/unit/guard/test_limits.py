@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.guard_facts import limits_of, stick_smoothing
 from mavbridge.core.rotation import quaternion_from_euler, tilt_rad
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
@@ -24,7 +25,6 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.guard.limits import (
     ActionSmoother,
-    LimitSettings,
     Smoothing,
     first_action,
     idle_action,
@@ -32,9 +32,14 @@ from mavbridge.guard.limits import (
 )
 from mavbridge.mavlink.codec.packets import MOST_LEAN_RAD
 
-SETTINGS = LimitSettings(
-    lean_rad=0.5, rate_radps=3.0, yaw_rate_radps=1.0, thrust=0.8, speed_mps=5.0, climb_mps=2.0
-)
+SETTINGS = {
+    "setpoint_lean": math.degrees(0.5),
+    "setpoint_rate": math.degrees(3.0),
+    "setpoint_yaw_rate": math.degrees(1.0),
+    "setpoint_thrust": 0.8,
+    "setpoint_speed": 5.0,
+    "setpoint_climb": 2.0,
+}
 FAR = 100.0
 KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
 number = st.floats(-FAR, FAR)
@@ -56,7 +61,7 @@ def test_each_kind_is_clipped_by_its_own_bounds_and_a_vector_keeps_its_direction
     far: Action, bound: Action
 ) -> None:
     kind = next(kind for kind, one in ACTION_CLASSES.items() if isinstance(far, one))
-    clipped = SETTINGS.of(kind).clip(far)
+    clipped = limits_of(kind, **SETTINGS).clip(far)
     assert type(clipped) is type(bound)
     assert clipped == pytest.approx(bound)
 
@@ -65,7 +70,7 @@ def test_each_kind_is_clipped_by_its_own_bounds_and_a_vector_keeps_its_direction
 def test_no_number_changes_faster_than_its_limit_nor_beyond_the_goal(
     kind: ActionKind, start: tuple[float, ...], goal: tuple[float, ...], dt_s: float
 ) -> None:
-    limits, make = SETTINGS.of(kind), ACTION_CLASSES[kind]
+    limits, make = limits_of(kind, **SETTINGS), ACTION_CLASSES[kind]
     now, wanted = limits.clip(make(*start)), limits.clip(make(*goal))
     moved = limits.approach(now, wanted, dt_s)
     for a, b, goal_value, rate in zip(now, moved, wanted, limits.change_per_s, strict=True):
@@ -74,7 +79,7 @@ def test_no_number_changes_faster_than_its_limit_nor_beyond_the_goal(
 
 
 def test_a_velocity_is_changed_within_the_acceleration_in_any_direction() -> None:
-    moved = SETTINGS.of("velocity").approach(
+    moved = limits_of("velocity", **SETTINGS).approach(
         Velocity(0.0, 0.0, 0.0, 0.0), Velocity(3.0, 4.0, -2.0, 1.0), 0.1
     )
     assert moved == pytest.approx(Velocity(0.3, 0.4, -0.5, 1.0))
@@ -101,22 +106,9 @@ def test_neutral_is_level_or_at_rest_and_idle_stays_on_the_ground(
         assert (type(found), found) == (type(wanted), wanted)
 
 
-def test_the_shipped_limits() -> None:
-    assert LimitSettings() == LimitSettings(
-        stick_slew_per_s=8.0,
-        lean_rad=math.radians(35.0),
-        rate_radps=math.radians(220.0),
-        yaw_rate_radps=math.radians(120.0),
-        thrust=0.9,
-        speed_mps=8.0,
-        climb_mps=3.0,
-        accel_mps2=5.0,
-    )
-
-
 def test_a_slew_of_0_is_no_limit() -> None:
-    assert LimitSettings().of("sticks").change_per_s == (8.0,) * 4
-    assert LimitSettings(stick_slew_per_s=0.0).of("sticks").change_per_s == (math.inf,) * 4
+    assert limits_of("sticks").change_per_s == (8.0,) * 4
+    assert stick_smoothing(max_slew_per_s=0.0).limits.change_per_s == (math.inf,) * 4
 
 
 def test_where_the_vehicle_has_not_said_what_it_does_a_flight_begins_level_and_at_rest() -> None:
@@ -175,7 +167,7 @@ def test_body_rates_stay_body_rates_although_they_start_from_an_idle_attitude(
     tau_s: float,
 ) -> None:
     """Their numbers under the name of an attitude would be a lean."""
-    limits = LimitSettings().of("rates")
+    limits = limits_of("rates")
     smoother = ActionSmoother(
         Smoothing(limits=limits, tau_s=tau_s), idle_action(ActionMeaning(kind="rates"))
     )

@@ -1,7 +1,6 @@
 """The table of the engagement, row by row: docs/safety.md shows it to pilots."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from helpers.guard_facts import (
     ON_GROUND,
     PX4_MODES,
     Stepped,
+    altered,
     codes,
     flying,
 )
@@ -20,7 +20,6 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.guard import engagement
-from mavbridge.guard.sequences import DisengageSettings
 from mavbridge.guard.table import PROGRESS, TABLE, Transition
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
@@ -34,14 +33,15 @@ RADIO_FAILSAFE = {"is_failsafe": True, "mode": "RTL"}
 DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
 SIGNAL = EndRequest(because(Code.SIGNAL))
 SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
-NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
-IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
-LANDS = DisengageSettings(on_fault="rtl", then="land")
-OFFBOARD = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
+NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
+IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
+LANDS: dict[str, Any] = {"on_fault": "rtl", "then": "land"}
+OFFBOARD = altered(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 SETPOINTS: dict[str, Any] = {
     "is_setpoint": True,
     "modes": ("OFFBOARD",),
-    "disengage": DisengageSettings(is_setpoint=True, on_fault="land", then="rtl"),
+    "on_fault": "land",
+    "then": "rtl",
     "engage_channel": 7,
 }
 
@@ -54,7 +54,7 @@ def waiting(facts: Any = AIRBORNE, **settings: Any) -> Stepped:
 
 def arming(**settings: Any) -> Stepped:
     """By ``--arm``, still disarmed."""
-    stepped = Stepped(ON_GROUND, arm=True, disengage=LANDS, **settings)
+    stepped = Stepped(ON_GROUND, arm=True, **LANDS, **settings)
     stepped.run(0.1, echo_confirmed=True)
     return stepped
 
@@ -68,7 +68,7 @@ def armed(**settings: Any) -> Stepped:
 
 def asked() -> Stepped:
     """For ALT_HOLD, by an act in the air; the pilot has the sticks."""
-    facts = replace(AIRBORNE, mode="LOITER", is_released=True)
+    facts = altered(AIRBORNE, mode="LOITER", is_released=True)
     stepped = waiting(facts, mode="ALT_HOLD", engage_channel=7)
     stepped.step("engage")
     return stepped
@@ -76,7 +76,7 @@ def asked() -> Stepped:
 
 def flowing() -> Stepped:
     """OFFBOARD was asked for, by an act in the air."""
-    stepped = waiting(replace(OFFBOARD, mode="AUTO.LOITER", is_released=True), **SETPOINTS)
+    stepped = waiting(altered(OFFBOARD, mode="AUTO.LOITER", is_released=True), **SETPOINTS)
     stepped.step("engage")
     stepped.run(0.12)
     return stepped
@@ -90,7 +90,7 @@ def entering() -> Stepped:
 
 
 def leaving(facts: Any = NO_RECEIVER, **settings: Any) -> Stepped:
-    stepped = flying(facts, disengage=LANDS, **settings)
+    stepped = flying(facts, **LANDS, **settings)
     stepped.step(chunk_fault=NO_CHUNK)
     return stepped
 
@@ -141,7 +141,7 @@ silent = {"heard_ns": 0}
 CASES = {
     # WAITING and RELEASED
     "somebody arms": Case(partial(waiting, ON_GROUND), {"armed": True}, WAITING),
-    "it says what it waits for": Case(waiting, {"link_problem": because(LOST), "chunk_problem":
+    "it says what it waits for": Case(waiting, {"problem": because(LOST), "chunk_problem":
         NO_IMAGE}, WAITING, why=LOST),
     "no image": Case(waiting, {"chunk_problem": NO_IMAGE}, WAITING, why=Code.NO_IMAGE),
     "end before a flight": Case(waiting, {"stop": SIGNAL}, ENDED),
@@ -149,11 +149,11 @@ CASES = {
     "end after a flight": Case(released, {"stop": SIGNAL}, ENDED),
     "duration over after a takeover": Case(lambda: after(partial(released, duration_ns=NS_PER_S),
         0.97), {}, ENDED),
-    "--arm waits for the link": Case(partial(waiting, replace(ON_GROUND,
-        link_problem=because(LOST)), arm=True), {}, WAITING),
-    "--arm, a parameter refused": Case(partial(waiting, replace(ON_GROUND,
-        link_problem=because(LOST)), arm=True), {"link_problem": because(Code.SET_REFUSED)}, ENDED),
-    "a parameter refused, no --arm": Case(waiting, {"link_problem": because(Code.SET_REFUSED)},
+    "--arm waits for the link": Case(partial(waiting, altered(ON_GROUND,
+        problem=because(LOST)), arm=True), {}, WAITING),
+    "--arm, a parameter refused": Case(partial(waiting, altered(ON_GROUND,
+        problem=because(LOST)), arm=True), {"problem": because(Code.SET_REFUSED)}, ENDED),
+    "a parameter refused, no --arm": Case(waiting, {"problem": because(Code.SET_REFUSED)},
         WAITING, why=Code.SET_REFUSED),
     "--arm": Case(partial(Stepped, ON_GROUND, arm=True), {}, PREPARING, IDLE,
         why=Code.WAITING_FOR_ARMING),
@@ -163,7 +163,7 @@ CASES = {
     "act after a takeover": Case(released, ACT, FLYING, POLICY),
     "act, the policy not reset": Case(waiting, {**ACT, "is_policy_reset": False}, PREPARING,
         why=Code.FIRST_CHUNK),
-    "act, another mode wanted": Case(partial(waiting, replace(AIRBORNE, mode="LOITER"),
+    "act, another mode wanted": Case(partial(waiting, altered(AIRBORNE, mode="LOITER"),
         mode="ALT_HOLD"), ACT, PREPARING, mode="ALT_HOLD"),
     "act in a step with the key": Case(partial(waiting, ON_GROUND, engage_on_arm=True), {**KEY,
         "armed": True}, WAITING),
@@ -173,12 +173,12 @@ CASES = {
             (Code.NOT_ARMED, {"armed": False}),
             (Code.WRONG_MODE, {"mode": "LOITER"}),
             (Code.NO_IMAGE, {"chunk_problem": NO_IMAGE}),
-            (LOST, {"link_problem": because(LOST), "chunk_problem": NO_IMAGE}),
+            (LOST, {"problem": because(LOST), "chunk_problem": NO_IMAGE}),
             (Code.FAILSAFE, {"is_failsafe": True, "envelope_problem": TILT}),
             (Code.BEYOND, {"envelope_problem": TILT, "chunk_problem": NO_IMAGE}),
         )
     },
-    "act refused: the switch is low": Case(partial(waiting, replace(AIRBORNE, **SWITCH_LOW),
+    "act refused: the switch is low": Case(partial(waiting, altered(AIRBORNE, **SWITCH_LOW),
         engage_channel=7), {**ACT, "envelope_problem": TILT}, WAITING,
         refusal=Code.ENGAGE_SWITCH_OFF),
     "act refused after a takeover": Case(released, {**ACT, "chunk_problem": NO_IMAGE}, RELEASED,
@@ -198,7 +198,7 @@ CASES = {
     "switch low with --arm": Case(partial(arming, engage_channel=7), SWITCH_LOW, PREPARING, IDLE),
     "another mode on the ground": Case(arming, {"mode": "LOITER"}, RELEASING, RELEASE,
         why=Code.MODE_CHANGED),
-    "another mode before ours is there": Case(partial(waiting, replace(ON_GROUND, mode="STABILIZE"),
+    "another mode before ours is there": Case(partial(waiting, altered(ON_GROUND, mode="STABILIZE"),
         arm=True), {"mode": "LOITER"}, PREPARING, IDLE),
     "failsafe on the ground": Case(arming, {"is_failsafe": True}, PREPARING, IDLE),
     "failsafe": Case(armed, RADIO_FAILSAFE, RELEASING, RELEASE, why=Code.FAILSAFE),
@@ -231,8 +231,8 @@ CASES = {
     **{
         f"takeover: {code.value}": Case(flying, changes, RELEASING, RELEASE, why=code)
         for code, changes in (
-            (Code.REBOOTED, {**REBOOT, "overruled": OVERRULED}),
-            (Code.OVERRULED, {"overruled": OVERRULED, "is_switched_off": True}),
+            (Code.REBOOTED, {**REBOOT, "problem": OVERRULED, "is_overruled": True}),
+            (Code.OVERRULED, {"problem": OVERRULED, "is_overruled": True, "is_switched_off": True}),
             (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True, "armed": False}),
             (Code.DISARMED, {"armed": False, "is_failsafe": True}),
             (Code.FAILSAFE, RADIO_FAILSAFE),
@@ -256,31 +256,31 @@ CASES = {
             (Code.MODE_CHANGED, {"mode": "AUTO.LOITER"}),
             (Code.DISARMED, {"armed": False}),
             (Code.FAILSAFE, {"is_failsafe": True}),
-            (Code.OVERRULED, {"overruled": OVERRULED}),
+            (Code.OVERRULED, {"problem": OVERRULED, "is_overruled": True}),
             (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True}),
         )
     },
-    "setpoints in a mode of sticks": Case(partial(flying, replace(OFFBOARD, mode="POSCTL"),
+    "setpoints in a mode of sticks": Case(partial(flying, altered(OFFBOARD, mode="POSCTL"),
         **{**SETPOINTS, "modes": ("POSCTL")}), REBOOT, RELEASING, RELEASE),
-    "sticks in a mode of setpoints": Case(partial(flying, replace(AIRBORNE, mode="GUIDED"),
+    "sticks in a mode of setpoints": Case(partial(flying, altered(AIRBORNE, mode="GUIDED"),
         modes=("GUIDED")), REBOOT, RELEASING, RELEASE),
-    "key": Case(partial(flying, disengage=LANDS), KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
-    "signal": Case(partial(flying, disengage=LANDS), {"stop": SIGNAL, **KEY}, LEAVING, NEUTRAL,
+    "key": Case(partial(flying, **LANDS), KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
+    "signal": Case(partial(flying, **LANDS), {"stop": SIGNAL, **KEY}, LEAVING, NEUTRAL,
         "LAND", Code.SIGNAL),
-    "death": Case(partial(flying, disengage=LANDS), {"stop": DEATH}, LEAVING, NEUTRAL, "RTL",
+    "death": Case(partial(flying, **LANDS), {"stop": DEATH}, LEAVING, NEUTRAL, "RTL",
         DEATH.reason.code),
-    "duration": Case(lambda: after(partial(flying, disengage=LANDS, duration_ns=NS_PER_S), 0.99),
+    "duration": Case(lambda: after(partial(flying, **LANDS, duration_ns=NS_PER_S), 0.99),
         {"landing": because(Code.LANDED)}, LEAVING, NEUTRAL, "LAND", Code.DURATION),
     "not the duration yet": Case(lambda: after(partial(flying, duration_ns=NS_PER_S), 0.98), {},
         FLYING, POLICY),
-    "landed": Case(partial(flying, disengage=LANDS), {"landing": because(Code.LANDED),
+    "landed": Case(partial(flying, **LANDS), {"landing": because(Code.LANDED),
         "chunk_fault": NO_CHUNK}, LEAVING, NEUTRAL, "LAND", Code.LANDED),
     **{
         f"fault: {code.value}": Case(
-            partial(flying, disengage=LANDS), changes, LEAVING, NEUTRAL, "RTL", code
+            partial(flying, **LANDS), changes, LEAVING, NEUTRAL, "RTL", code
         )
         for code, changes in (
-            (LOST, {"link_problem": because(LOST), "chunk_fault": NO_CHUNK}),
+            (LOST, {"problem": because(LOST), "chunk_fault": NO_CHUNK}),
             (Code.NO_CHUNK, {"chunk_fault": NO_CHUNK, "envelope_problem": TILT}),
             (Code.BEYOND, {"envelope_problem": TILT}),
         )

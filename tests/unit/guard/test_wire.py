@@ -3,6 +3,7 @@
 import math
 import os
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from enum import Enum
 from functools import partial
@@ -28,7 +29,6 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.sequences import DisengageSettings
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest, Outcome, Phase
 from mavbridge.guard.wire import (
@@ -52,7 +52,7 @@ STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
 FLIGHT = flight_settings(
     smoothing=stick_smoothing(max_slew_per_s=8.0, tau_s=0.05),
     envelope=EnvelopeLimits(height_m=math.inf),
-    engagement=engagement_settings(disengage=DisengageSettings(then="rtl")),
+    engagement=engagement_settings(then="rtl"),
 )
 CHUNK = Chunk(
     serial=7,
@@ -65,13 +65,12 @@ CHUNK = Chunk(
     actions=(STICKS, Sticks(1e-300, -0.0, math.inf, 1.0)),
 )
 TICK = GuardTick(
-    index=3,
+    slot=3,
     due_ns=10,
     woke_ns=11,
     decided_ns=11,
     sent_ns=12,
     missed_slots=2,
-    is_slot=True,
     is_coasting=False,
     chunk_serial=7,
     trace=ActionTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
@@ -106,13 +105,17 @@ SUMMARY = GuardSummary(
 )
 TO_GUARD: list[ToGuard] = [
     NoChunk(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
-    GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
+    GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9),
     FLIGHT,
     EndRequest(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
     "engage",
     "release",
 ]
 FROM_GUARD: list[FromGuard] = [
+    TICK,
+    TICK._replace(
+        slot=None, chunk_serial=None, trace=None, sent=None, reason=because(Code.NO_IMAGE)
+    ),
     Samples(()),
     Samples(
         (
@@ -152,12 +155,6 @@ def test_what_the_guard_sends_arrives_as_it_was(message: FromGuard) -> None:
     assert type(received) is type(message)
 
 
-plain = st.sampled_from((Code.NO_IMAGE, Code.DURATION, Code.LANDED)).map(because)
-figures = st.fixed_dictionaries({"age_s": st.floats(allow_nan=False)})
-reasons = st.recursive(
-    plain | figures.map(lambda data: because(Code.IMAGE_FROZEN, **data)),
-    lambda inner: st.builds(because, st.just(Code.OF_CAMERA), camera=st.text(), why=inner),
-)
 stamps = st.integers(-(2**63), 2**63 - 1)
 sticks = st.builds(Sticks, *[st.floats(width=64)] * 4)
 
@@ -176,42 +173,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
     assert [bits(action) for action in received.actions] == [bits(action) for action in actions]
 
 
-@given(
-    st.builds(
-        GuardTick,
-        index=stamps,
-        due_ns=stamps,
-        woke_ns=stamps,
-        decided_ns=stamps,
-        sent_ns=stamps,
-        missed_slots=st.integers(0, 2**31 - 1),
-        is_slot=st.booleans(),
-        is_coasting=st.booleans(),
-        chunk_serial=st.none() | stamps,
-        trace=st.none()
-        | st.builds(ActionTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
-        sent=st.none() | sticks,
-        phase=st.sampled_from(Phase),
-        reason=st.none() | reasons,
-    )
-)
-def test_any_tick_arrives_bit_by_bit(tick: GuardTick) -> None:
-    received = decode_from_guard(encode_from_guard(tick))
-    assert isinstance(received, GuardTick)
-    plain = {"trace": None, "sent": None}
-    assert replace(received, **plain) == replace(tick, **plain)  # type: ignore[arg-type]
-    assert (received.trace is None, received.sent is None) == (
-        tick.trace is None,
-        tick.sent is None,
-    )
-    if tick.sent is not None and received.sent is not None:
-        assert bits(received.sent) == bits(tick.sent)
-    if tick.trace is not None and received.trace is not None:
-        for stage in ("raw", "clipped", "slewed", "smoothed"):
-            assert bits(getattr(received.trace, stage)) == bits(getattr(tick.trace, stage))
-
-
-@pytest.mark.parametrize("data", [b"", b"\0", b"Q", b"S", b"Snonsense", b"C", b"T", b"R\0"])
+@pytest.mark.parametrize("data", [b"", b"\0", b"Q", b"S", b"Snonsense", b"C", b"R\0"])
 def test_what_is_no_message_is_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(data)
@@ -219,21 +181,22 @@ def test_what_is_no_message_is_refused(data: bytes) -> None:
         decode_from_guard(data)
 
 
-@pytest.mark.parametrize("whole", [encode_to_guard(CHUNK), encode_to_guard(FLIGHT)])
-def test_a_message_to_the_guard_that_is_cut_off_or_too_long_is_refused(whole: bytes) -> None:
+@pytest.mark.parametrize(
+    ("decode", "whole"),
+    [
+        (decode_to_guard, encode_to_guard(CHUNK)),
+        (decode_to_guard, encode_to_guard(FLIGHT)),
+        (decode_from_guard, encode_from_guard(TICK)),
+    ],
+)
+def test_a_message_that_is_cut_off_or_too_long_is_refused(
+    decode: Callable[[bytes], object], whole: bytes
+) -> None:
     for length in range(len(whole)):
         with pytest.raises(ValueError, match="not a message"):
-            decode_to_guard(whole[:length])
+            decode(whole[:length])
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(encode_to_guard(CHUNK) + b"\0")
-
-
-@pytest.mark.parametrize("message", [TICK, STATUS, SUMMARY])
-def test_a_message_of_the_guard_that_is_cut_off_is_refused(message: FromGuard) -> None:
-    whole = encode_from_guard(message)
-    for length in range(len(whole)):
-        with pytest.raises(ValueError, match="not a message"):
-            decode_from_guard(whole[:length])
 
 
 @pytest.mark.parametrize("number", [np.float64(1.5), np.float32(1.5), np.int64(7), np.bool_(True)])

@@ -120,7 +120,7 @@ def test_every_setting_of_a_flight_comes_back(tmp_path: Path) -> None:
         link=LinkConfig(connect="udp:1.2.3.4:5", set=("A=1",)),
         policy=PolicyConfig(policy="toge:small", checkpoint=Path("my.safetensors"), seed=2),
         camera=CameraConfig(camera=("front=0", "down=1")),
-        rates=Rates(visual_rate="auto:5:20"),
+        rates=Rates(visual_rate=20.0),
         limits=Limits(tau=0.1),
         record=tmp_path,
     )

@@ -131,7 +131,7 @@ def flown(index: int) -> Tick:
         texts=TEXTS if index == 0 else (),
     )
     if index == NAN_TICK and tick.trace is not None:
-        return replace(tick, trace=replace(tick.trace, raw=Sticks(float("nan"), 0, 0, 0)))
+        return replace(tick, trace=tick.trace._replace(raw=Sticks(float("nan"), 0, 0, 0)))
     if index == BLIND_TICK:
         return replace(tick, state=None, position_ned_m=None, feature_captured_ns=None)
     return tick

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import pytest
 from rich.console import Console
 
-from helpers.factories import make_guard_tick, make_tick
+from helpers.factories import make_guard_tick, make_plan, make_tick
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, Shown
@@ -15,7 +15,6 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
-from mavbridge.flight.state import Freshness
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
 from mavbridge.mavlink.codec.tlog import PacketPipe
@@ -54,7 +53,7 @@ class Viewed:
 def viewed() -> Iterator[Viewed]:
     sink = ListSink()
     ours, guards = map(SocketPort, channel_pair())
-    view = PilotView(sink=sink, freshness=Freshness(attitude_ns=1, velocity_ns=1), samples=ours)
+    view = PilotView(make_plan(), sink=sink, samples=ours)
     yield Viewed(sink, view, WireEnd(), guards)
     ours.close()
     guards.close()
