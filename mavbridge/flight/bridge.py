@@ -8,6 +8,7 @@ from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import Clock, period_ns
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.feature_cache import FeatureCache
@@ -17,7 +18,6 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.wire import NoChunk
 from policy.protocol import PolicyRunner
 
 
@@ -48,7 +48,7 @@ def build_bridge(
     runner: PolicyRunner,
     *,
     clock: Clock,
-    send: Callable[[Chunk | NoChunk], object],
+    send: Callable[[Chunk | Reason], object],
     cameras: Sequence[CameraPath],
     sinks: Sequence[TickSink],
     watches_images: bool,

@@ -20,7 +20,6 @@ from mavbridge.flight.state import FrozenStateCheck, Observation, ObservationSou
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
 from policy.protocol import PolicyRunner
 
@@ -50,7 +49,7 @@ class PolicyLoop:
         clock: Clock,
         view: TelemetryCache,
         caches: Sequence[FeatureCache],
-        send: Callable[[Chunk | NoChunk], object],
+        send: Callable[[Chunk | Reason], object],
         watch: Callable[[Solve], object] | None = None,
     ) -> None:
         """Join a policy, telemetry and the caches of its cameras, in the contract's order.
@@ -98,7 +97,7 @@ class PolicyLoop:
             self._run(stop)
         except BaseException:
             with suppress(Exception):  # no memory: the first error is the one to raise
-                self._send(NoChunk(because(Code.POLICY_FAILED)))
+                self._send(because(Code.POLICY_FAILED))
             raise
 
     def _run(self, stop: threading.Event) -> None:
@@ -113,7 +112,7 @@ class PolicyLoop:
             ):
                 self.step()
             else:
-                self._send(NoChunk(because(Code.NO_READING, quantity="attitude")))
+                self._send(because(Code.NO_READING, quantity="attitude"))
             self.alive_ns = self._clock.now_ns()
 
     @property
@@ -185,7 +184,7 @@ class PolicyLoop:
         if self._due_ns is not None:
             soon_ns = self._clock.now_ns() + RETRY_NS + self._period_ns // 4
             self._due_ns = min(self._due_ns, soon_ns)
-        self._send(NoChunk(reason))
+        self._send(reason)
 
     def _solve(
         self, state: VehicleState, observation: Observation, now_ns: int, plan: Chunk | None

@@ -21,7 +21,6 @@ from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardError,
-    GuardMessage,
     GuardStatus,
     GuardSummary,
     GuardTick,
@@ -162,7 +161,7 @@ class TelemetryCache:
                 if message[:4] != self.status[:4]:
                     _log.debug("vehicle: %s, %s, armed %s, landed %s", *message[:4])
                 self.status = message
-            case GuardMessage(text):
+            case str() as text:
                 self._texts.append(text)
             case Packets(packets):
                 self._watch_packets(packets)

@@ -20,7 +20,6 @@ from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest
 from mavbridge.guard.wire import (
     GuardError,
-    GuardMessage,
     GuardSummary,
     decode_to_guard,
     encode_from_guard,
@@ -72,7 +71,7 @@ def _run(
         return
     with (store := SigningStore(files, clock)) as signing:
         if store.problem is not None:
-            port.send(encode_from_guard(GuardMessage(store.problem)))
+            port.send(encode_from_guard(store.problem))
         _fly(settings, port, samples, received, clock, signing)
 
 
@@ -101,7 +100,7 @@ def _fly(
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     refusal = settle_guard(realtime=settings.realtime)
     if refusal is not None:
-        port.send(encode_from_guard(GuardMessage(refusal)))
+        port.send(encode_from_guard(refusal))
     try:
         loop.run(port)
     except BaseException:

@@ -25,11 +25,9 @@ from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 from mavbridge.guard.wire import (
-    GuardMessage,
     GuardStatus,
     GuardTick,
     LastWords,
-    NoChunk,
     Packets,
     decode_to_guard,
     encode_from_guard,
@@ -266,7 +264,7 @@ class GuardLoop:
         if actions.takeoff_m is not None:
             self._attempt(partial(commands.takeoff, actions.takeoff_m))
         for text in output.messages:
-            self._flight.send(encode_from_guard(GuardMessage(text)))
+            self._flight.send(encode_from_guard(text))
 
     def _finish(self, now_ns: int) -> None:
         """For at most FINISH_NS, restore parameters and send an outstanding release."""
@@ -291,7 +289,7 @@ class GuardLoop:
             self._vehicle = vehicle
             self._report_status(vehicle)
         for text in snapshot.texts:
-            self._flight.send(encode_from_guard(GuardMessage(text)))
+            self._flight.send(encode_from_guard(text))
 
     def _report_status(self, vehicle: VehicleStatus | None) -> None:
         status = GuardStatus(
@@ -317,7 +315,7 @@ class GuardLoop:
             match decode_to_guard(data):
                 case Chunk() as chunk:
                     absence = None
-                case NoChunk(absence):
+                case Reason() as absence:
                     pass
                 case FlightSettings() as settings if self._guard is None:
                     self._guard = Guard(settings, self._clock.now_ns())

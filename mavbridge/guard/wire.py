@@ -95,12 +95,6 @@ class GuardStatus(NamedTuple):
     """True if the policy takes a position and the estimator has a valid one."""
 
 
-class GuardMessage(NamedTuple):
-    """One line of text for the user."""
-
-    text: str
-
-
 class LastWords(NamedTuple):
     """Packets for the flight process to send if the guard dies; replaces the previous ones."""
 
@@ -123,12 +117,6 @@ class GuardError(NamedTuple):
     text: str
 
 
-class NoChunk(NamedTuple):
-    """Reason why the flight process cannot compute a chunk now."""
-
-    reason: Reason
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardSummary:
     """Last message of a guard that ends normally."""
@@ -146,19 +134,14 @@ class GuardSummary:
     """Packets dropped because the telemetry log's pipe was full."""
 
 
-ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | NoChunk | OperatorCommand | EndRequest
+ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | Reason | OperatorCommand | EndRequest
+"""A reason tells why the flight process cannot compute a chunk now."""
 FromGuard: TypeAlias = (
-    Samples
-    | Packets
-    | GuardTick
-    | GuardStatus
-    | GuardMessage
-    | LastWords
-    | GuardError
-    | GuardSummary
+    Samples | Packets | GuardTick | GuardStatus | str | LastWords | GuardError | GuardSummary
 )
+"""Text is one line for the user."""
 
-_TO_GUARD = (GuardSettings, FlightSettings, NoChunk, str, EndRequest)
+_TO_GUARD = (GuardSettings, FlightSettings, Reason, str, EndRequest)
 
 
 def encode_to_guard(message: ToGuard) -> bytes:

@@ -24,7 +24,7 @@ from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import ActionKind
 from mavbridge.guard.memory import ACT_TIMEOUT_NS
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardMessage, GuardTick
+from mavbridge.guard.wire import GuardTick
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.network import VEHICLE
 from sitl.vehicle.config import AutopilotName
@@ -175,8 +175,8 @@ class HostileFlight:
         for report in flight.guard_port.reports:
             if isinstance(report, GuardTick):
                 self._follow(report)
-            elif isinstance(report, GuardMessage):
-                self._told.append(report.text)
+            elif isinstance(report, str):
+                self._told.append(report)
         del flight.guard_port.reports[:-1], flight.down.sent[:], flight.up.sent[:]
         flight.sink.events.clear()
         del flight.samples[:-1]

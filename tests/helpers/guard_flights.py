@@ -27,7 +27,7 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
-from mavbridge.guard.wire import GuardMessage, GuardTick, LastWords, ToGuard, encode_to_guard
+from mavbridge.guard.wire import GuardTick, LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
@@ -335,7 +335,7 @@ class GuardFlight:
     @property
     def messages(self) -> list[str]:
         """Lines for the user."""
-        return [r.text for r in self.guard_port.reports if isinstance(r, GuardMessage)]
+        return [r for r in self.guard_port.reports if isinstance(r, str)]
 
     def phases(self, since_ns: int = 0) -> list[Phase]:
         """Phases in order, without repeats."""

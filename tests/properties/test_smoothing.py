@@ -160,23 +160,3 @@ def test_the_longest_step_is_15_periods_of_100_hz_unless_said_otherwise() -> Non
     smoother.step(NEUTRAL, 0)
     after_stall = smoother.step(Sticks(1.0, 0.0, 0.0, 0.0), NS_PER_S).smoothed
     assert after_stall.throttle == pytest.approx(0.15)
-
-
-@pytest.mark.parametrize("rate_hz", [10, 16, 50, 100, 200])
-def test_the_slew_is_the_same_for_a_policy_that_cannot_keep_up(rate_hz: int) -> None:
-    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=2.0, tau_s=0.0), NEUTRAL)
-    smoother.reset(NEUTRAL)
-    full = Sticks(1.0, 0.0, 0.0, 0.0)
-    for tick in range(round(0.4 * rate_hz) + 1):
-        out = smoother.step(full, tick * NS_PER_S // rate_hz).smoothed.throttle
-    assert out == pytest.approx(2.0 * round(0.4 * rate_hz) / rate_hz)
-
-
-def test_stages_can_be_switched_off() -> None:
-    smoother = ActionSmoother(
-        stick_smoothing(max_slew_per_s=0.0, tau_s=0.0, max_dt_s=0.03), NEUTRAL
-    )
-    smoother.reset(NEUTRAL)
-    trace_ = smoother.step(Sticks(2.0, -0.5, 0.25, 0.0), 0)
-    assert trace_.raw == (2.0, -0.5, 0.25, 0.0)
-    assert trace_.clipped == trace_.slewed == trace_.smoothed == (1.0, -0.5, 0.25, 0.0)

@@ -26,7 +26,7 @@ from mavbridge.flight.state import StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk, Samples
+from mavbridge.guard.wire import GuardStatus, GuardTick, Samples
 from mavbridge.mavlink.session.telemetry import PacketDecoder
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
@@ -122,9 +122,9 @@ class _Loop:
             self._clock.sleep_until_ns(recorded.computed_ns)
         return chunk
 
-    def _sent(self, message: Chunk | NoChunk) -> None:
-        if isinstance(message, NoChunk):
-            self._refusal = message.reason
+    def _sent(self, message: Chunk | Reason) -> None:
+        if isinstance(message, Reason):
+            self._refusal = message
 
     def _keep(self, solve: Solve) -> None:
         self._solve = solve

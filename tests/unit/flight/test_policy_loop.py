@@ -19,7 +19,7 @@ from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import NoChunk, Samples
+from mavbridge.guard.wire import Samples
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -41,7 +41,7 @@ class Rig:
         plan = make_plan(meaning, rates=Rates(action_rate=1000 / period_ms))
         self.clock, self.cache = FakeClock(), FeatureCache()
         self.view = TelemetryCache(plan, sink=ListSink())
-        self.sent: list[Chunk | NoChunk] = []
+        self.sent: list[Chunk | Reason] = []
         self.solves = self.resets = 0
         self.north_mps, self.solve_ns, self.given = 0.0, 3 * MS, (np.zeros(0, np.float32),) * 3
         self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
@@ -197,7 +197,7 @@ def test_without_usable_inputs_the_policy_is_not_asked(
 ) -> None:
     rig = prepare(Rig())
     rig.loop.step()
-    assert rig.sent == [NoChunk(reason)]
+    assert rig.sent == [reason]
     assert rig.solves == 0
 
 
@@ -208,8 +208,8 @@ def test_a_chunk_of_another_shape_is_not_passed_on(shape: tuple[int, ...]) -> No
     rig = Rig(lambda: np.zeros(shape, np.float32)).measure().see()
     rig.loop.step()
     (refused,) = rig.sent
-    assert isinstance(refused, NoChunk)
-    assert refused.reason == because(Code.WRONG_SHAPE, shape=str(list(shape)), most=MAX_HORIZON)
+    assert isinstance(refused, Reason)
+    assert refused == because(Code.WRONG_SHAPE, shape=str(list(shape)), most=MAX_HORIZON)
 
 
 def run_on(rig: Rig, milliseconds: int) -> Rig:
@@ -267,8 +267,8 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
     rig.view.wait_for_attitude = wait  # type: ignore[method-assign]
     before_ns = rig.loop.alive_ns
     rig.loop.run(stop)
-    told = [one if isinstance(one, NoChunk) else one.serial for one in rig.sent]
-    assert told == [1, NoChunk(NO_ATTITUDE), 2, NoChunk(NO_ATTITUDE)]
+    told = [one if isinstance(one, Reason) else one.serial for one in rig.sent]
+    assert told == [1, NO_ATTITUDE, 2, NO_ATTITUDE]
     assert rig.loop.alive_ns > before_ns
 
 
@@ -281,4 +281,4 @@ def test_a_policy_that_fails_is_told_to_the_guard_at_once(failure: type[BaseExce
     rig.view.wait_for_attitude = lambda *_, **__: True  # type: ignore[method-assign]
     with pytest.raises(failure):
         rig.loop.run(threading.Event())
-    assert rig.sent == [NoChunk(because(Code.POLICY_FAILED))]
+    assert rig.sent == [because(Code.POLICY_FAILED)]

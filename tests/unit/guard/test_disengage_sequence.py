@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, Stepped, altered, codes, flying
+from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.core.vehicle import ModeRoles
@@ -291,6 +292,15 @@ def test_after_a_standstill_of_ours_what_had_arrived_tells_no_mode(facts: Any) -
     assert (first.control, first.mode) == (NEUTRAL, None), "the mode is of before"
     assert {move.mode for move in stepped.run(1)} == {None}
     assert stepped.step(mode_arrived_ns=None).mode == facts.link.modes.hold
+
+
+def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
+    stepped = flying(NO_RECEIVER)
+    standstill(stepped, 4, **FAULT)
+    until_ns = stepped.facts.now_ns + 50 * NS_PER_MS
+    stepped.run(0.1)
+    assert stepped.step(mode_arrived_ns=until_ns).mode is None
+    assert stepped.step(mode_arrived_ns=until_ns + 1).mode == "BRAKE"
 
 
 def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:

@@ -47,6 +47,7 @@ def test_the_autopilot_takes_off_before_sticks_fly() -> None:
     assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
     stepped.step(mode="ALT_HOLD")
     assert stepped.phase is Phase.FLYING
+    assert stepped.step(mode="GUIDED").control is RELEASE, "it was ours for the takeoff alone"
 
 
 def test_px4_takes_off_through_its_own_modes_and_gets_setpoints_before_offboard() -> None:

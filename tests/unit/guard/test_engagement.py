@@ -227,8 +227,10 @@ def test_what_was_not_confirmed_is_told_once() -> None:
 
 def test_each_flight_and_how_it_ended_is_counted() -> None:
     stepped = flying(altered(AIRBORNE, is_landed=None))
+    stepped.step()
     assert stepped.engagement.outcome == Outcome(flights=1)
     stepped.step(is_landed=True)
+    assert stepped.engagement.outcome.has_left_ground is False
     stepped.step(is_landed=False)
     stepped.step(is_landed=True)
     stepped.step(**FAULT)

@@ -25,11 +25,9 @@ from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.guard.wire import (
     FromGuard,
-    GuardMessage,
     GuardStatus,
     GuardTick,
     LastWords,
-    NoChunk,
     Samples,
     ToGuard,
     decode_from_guard,
@@ -132,7 +130,7 @@ class Rig:
 
     @property
     def texts(self) -> list[str]:
-        return [message.text for message in self.got(GuardMessage)]
+        return self.got(str)
 
 
 # --- what the flight process hears
@@ -151,9 +149,7 @@ def test_samples_are_passed_on_before_anything_else_with_their_stamps() -> None:
     readings = [sample.reading for sample in passed.samples]
     assert len(readings) == 4
     assert {(r.arrived_ns, r.happened_ns) for r in readings} == {(arrived_ns, arrived_ns - 3 * MS)}
-    assert [type(message) for message in rest] == [
-        *(GuardStatus, GuardMessage, GuardTick, LastWords)
-    ]
+    assert [type(message) for message in rest] == [*(GuardStatus, str, GuardTick, LastWords)]
 
 
 def test_the_vehicles_status_is_told_when_it_changes() -> None:
@@ -217,7 +213,7 @@ def test_samples_are_not_passed_on_before_somebody_reads_them() -> None:
 
 def test_before_a_policy_is_loaded_the_link_is_served_all_the_same() -> None:
     rig = Rig()
-    rig.tell("engage", rig.chunk(), NoChunk(because(Code.NO_IMAGE)))
+    rig.tell("engage", rig.chunk(), because(Code.NO_IMAGE))
     first_ns = rig.loop.step()
     assert first_ns == START_NS + IDLE_PERIOD_NS
     rig.run(0.1)

@@ -34,11 +34,9 @@ from mavbridge.guard.values import EndRequest, Outcome, Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardError,
-    GuardMessage,
     GuardStatus,
     GuardSummary,
     GuardTick,
-    NoChunk,
     Packets,
     Samples,
     ToGuard,
@@ -104,7 +102,7 @@ SUMMARY = GuardSummary(
     dropped_packets=2,
 )
 TO_GUARD: list[ToGuard] = [
-    NoChunk(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
+    because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE)),
     GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9),
     FLIGHT,
     EndRequest(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
@@ -134,7 +132,7 @@ FROM_GUARD: list[FromGuard] = [
     ),
     STATUS,
     GuardStatus("none", None, False, None, (), None),
-    GuardMessage("PreArm: Gyros inconsistent"),
+    "PreArm: Gyros inconsistent",
     GuardError("user", "another guard flies this vehicle"),
     SUMMARY,
     replace(SUMMARY, failure=None, link=replace(STATS, rtt_ms=None, lost_fraction=None)),
@@ -201,10 +199,10 @@ def test_a_message_that_is_cut_off_or_too_long_is_refused(
 
 @pytest.mark.parametrize("number", [np.float64(1.5), np.float32(1.5), np.int64(7), np.bool_(True)])
 def test_a_number_of_numpy_crosses_as_a_plain_one(number: Any) -> None:
-    message = NoChunk(because(Code.TOO_OLD, age_ms=number))
+    message = because(Code.TOO_OLD, age_ms=number)
     received = decode_to_guard(encode_to_guard(message))
     assert received == message
-    assert type(dict(received.reason.data)["age_ms"]) in (float, int, bool)
+    assert type(dict(received.data)["age_ms"]) in (float, int, bool)
 
 
 def test_reasons_cross_in_python_3_11_2(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,13 +212,13 @@ def test_reasons_cross_in_python_3_11_2(monkeypatch: pytest.MonkeyPatch) -> None
         return getattr, (type(code), code.name)
 
     monkeypatch.setattr(Enum, "__reduce_ex__", by_name)
-    message = NoChunk(because(Code.OF_CAMERA, camera="front", why=because(Code.NO_IMAGE)))
+    message = because(Code.OF_CAMERA, camera="front", why=because(Code.NO_IMAGE))
     assert decode_to_guard(encode_to_guard(message)) == message
 
 
 @pytest.mark.parametrize("foreign", [np.zeros(2), os.system, partial(print), Popen])
 def test_nothing_but_our_classes_crosses(foreign: Any) -> None:
     """Importing numpy would stall the guard."""
-    message = NoChunk(Reason(Code.TOO_OLD, (("age_ms", foreign),)))
+    message = Reason(Code.TOO_OLD, (("age_ms", foreign),))
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(encode_to_guard(message))

@@ -16,7 +16,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.guard.channel import SocketPort, channel_pair
-from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
+from mavbridge.guard.wire import GuardStatus, Packets
 from mavbridge.mavlink.codec.tlog import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
@@ -79,7 +79,7 @@ def test_the_message_with_the_sticks_is_counted_by_firmware(viewed: Viewed, auto
     viewed.view.receive(status(autopilot))
     for k in range(1, 4):
         viewed.view.receive(viewed.radio(START_NS + k))
-    viewed.view.receive(GuardMessage("a line"))
+    viewed.view.receive("a line")
     assert (viewed.view.stick_packets, viewed.view.sticks_ns) == (3, START_NS + 3)
 
 
