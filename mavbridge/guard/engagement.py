@@ -131,7 +131,7 @@ class Engagement(Memory):
             self._start(now, is_ready=problem is None)
             if self.starting_ns is None or not now.is_policy_reset or now.chunk_problem is not None:
                 return Actions()
-            self.fly(now, True)
+            self.fly(now, None)
             self.phase, self.starting_ns = Phase.FLYING, None
         return Actions(control=ControlSource.POLICY)
 

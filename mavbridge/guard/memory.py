@@ -112,7 +112,7 @@ class Memory:
             self.failure = cause.reason
             self.end_request, self.must_stop = cause, True
 
-    def fly(self, now: EngagementInputs, _cause: bool) -> None:
+    def fly(self, now: EngagementInputs, _cause: object) -> None:
         """the policy's actions, starting from the pilot's or idle sticks"""
         flights = self.outcome.flights + 1
         self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)

@@ -294,6 +294,14 @@ def test_after_a_standstill_of_ours_what_had_arrived_tells_no_mode(facts: Any) -
     assert stepped.step(mode_arrived_ns=None).mode == facts.link.modes.hold
 
 
+def test_a_standstill_is_longer_than_250_ms_and_a_silence_behind_it_lengthens_it() -> None:
+    assert standstill(flying(NO_RECEIVER), 0.24, **FAULT).mode == "BRAKE"
+    stepped = flying(NO_RECEIVER)
+    assert standstill(stepped, 4, **FAULT).mode is None
+    moves = stepped.run(1.0, heard_ns=stepped.facts.now_ns)
+    assert {move.mode for move in moves} == {None}
+
+
 def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
     stepped = flying(NO_RECEIVER)
     standstill(stepped, 4, **FAULT)
@@ -307,6 +315,7 @@ def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
     stepped = at_fault(IDLE_RECEIVER)
     silence(stepped, 10)
     moves = stepped.run(2.9, heard_ns=None, mode_arrived_ns=None)
+    assert moves[0].mode == "BRAKE"
     assert sum(move.mode == "BRAKE" for move in moves) == 29
     assert stepped.phase is Phase.LEAVING
 

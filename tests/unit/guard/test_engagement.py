@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, altered, flying
+from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, altered, engagement_settings, flying
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest, Outcome, Phase
 
 NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
@@ -35,7 +36,9 @@ def test_the_switch_engages_by_going_high_after_a_rest_and_releases_by_going_low
     stepped = switched(2000)
     assert set(stepped.run(1)) == {NOTHING}  # it was high from the start
     stepped.run(2, rc_channels_us=LOW)
+    assert stepped.engagement.refusal is None
     assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == FLIES
+    assert stepped.engagement.refusal is None
     assert stepped.step(rc_channels_us=LOW) == RELEASE
     assert stepped.codes == (Code.ENGAGE_SWITCH_OFF,)
 
@@ -110,6 +113,13 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     assert FLIES in stepped.run(0.3, rc_channels_us=HIGH)
 
 
+def test_a_receiver_that_is_sick_as_the_switch_goes_high_engages_nothing() -> None:
+    stepped = switched()
+    stepped.run(3)
+    stepped.run(0.2, rc_channels_us=HIGH)
+    assert stepped.step(is_receiver_sick=True) == NOTHING
+
+
 def test_the_dwell_counts_arrivals_and_not_the_time_that_an_old_value_stays() -> None:
     stepped = switched(channels_arrived_ns=0)
     stepped.run(0.45)
@@ -138,7 +148,7 @@ def test_a_vehicle_that_is_found_armed_was_not_armed_for_us(found_ns: int) -> No
     facts = replace(ON_GROUND, link=replace(ON_GROUND.link, status=None), status=NOT_FOUND)
     stepped = Stepped(facts, engage_on_arm=True)
     stepped.run(found_ns / NS_PER_S)
-    assert set(stepped.run(1, armed=True)) == {NOTHING}
+    assert set(stepped.run(1, armed=True, mode="ALT_HOLD")) == {NOTHING}
 
 
 # --- what is remembered from one flight to the next
@@ -278,6 +288,35 @@ def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
     assert (stepped.phase, stepped.codes) == (Phase.WAITING, (Code.NO_IMAGE,))
     assert stepped.step(chunk_problem=None) == FLIES
     assert (stepped.codes, stepped.engagement.outcome.flights) == ((), 2)
+
+
+def test_readonly_waits_for_the_policys_reset_and_stops_at_an_objection() -> None:
+    stepped, late, lost = Stepped(readonly=True), because(Code.NO_IMAGE), Code.HEARTBEAT_LOST
+    assert stepped.step(is_policy_reset=False, chunk_problem=late) == NOTHING
+    assert stepped.engagement.starting_ns is None
+    assert stepped.step(chunk_problem=None) == NOTHING
+    began_ns = stepped.facts.now_ns
+    assert stepped.step(chunk_problem=late) == NOTHING  # it is silent while it is reset
+    assert stepped.engagement.starting_ns == began_ns
+    assert stepped.step(is_policy_reset=True) == NOTHING
+    assert stepped.step(chunk_problem=None) == FLIES
+    assert stepped.step(problem=because(lost), chunk_problem=late) == NOTHING
+    assert stepped.codes == (lost,)
+
+
+def test_the_first_chunk_after_a_reset_may_take_two_periods_more() -> None:
+    stepped = Stepped()
+    stepped.engagement = Engagement(engagement_settings(), chunk_period_ns=NS_PER_S)
+    stepped.step()
+    stepped.step("engage", is_policy_reset=False)
+    stepped.run(5.0)
+    assert stepped.phase is Phase.PREPARING
+    stepped.step()
+    assert stepped.phase is not Phase.PREPARING
+
+
+def test_a_vehicle_that_is_silent_from_the_start_is_no_error() -> None:
+    assert Stepped().step(heard_ns=-NS_PER_S) == NOTHING
 
 
 @pytest.mark.parametrize("ends", ["stop", "duration"])
