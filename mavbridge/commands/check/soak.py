@@ -107,7 +107,7 @@ class FlightMeter:
         self._timing = FlightTiming(
             stick_hz=plan.config.rates.stick_rate,
             action_hz=plan.loops.action_hz,
-            vision_hz=plan.loops.max_vision_hz,
+            vision_hz=plan.loops.vision_hz,
         )
         self._first: Usage | None = None
         self._last: Usage | None = None
