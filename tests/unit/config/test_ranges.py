@@ -10,7 +10,6 @@ import pytest
 from mavbridge.commands import config as commands
 from mavbridge.config import episodes, flags, flight, policy, rates
 from mavbridge.config.flags import Ranged
-from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 
 CONFIGS = {
@@ -44,9 +43,3 @@ def test_settings_have_the_names_of_the_file() -> None:
     names = {name for name, _ in RANGES.values()}
     for name in ("limits.stall", "envelope.tilt", "setpoints.yaw_rate", "link.timeout", "gusts"):
         assert name in names
-
-
-@pytest.mark.parametrize("rate", ["auto:5", "auto:fast", "slow", "auto:0:30", "auto:10:300"])
-def test_a_visual_rate_is_a_number_or_a_range(rate: str) -> None:
-    with pytest.raises(UserError, match=r"rates\.visual"):
-        Rates(visual_rate=rate)
