@@ -23,7 +23,8 @@ from mavbridge.commands.output import (
     require_outputs,
     table_console,
 )
-from mavbridge.config.flight import FlyConfig
+from mavbridge.config.flight import FlyConfig, Limits
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.settings_files import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
@@ -165,17 +166,12 @@ def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:
 
 def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
     """Return the flags of the flight, overridden by those of the replay."""
-    limits = {
-        field.name: getattr(asked, field.name)
-        for field in fields(flown.limits)
-        if getattr(asked, field.name, None) is not None
-    }
-    names = ("policy", "checkpoint", "contract", "num_diffusion_steps")
-    policy: dict[str, Any] = {
-        name: getattr(asked, name)
-        for name in (*names, "engine", "device")
-        if getattr(asked, name) is not None
-    }
+
+    def given(config: Limits | PolicyConfig) -> dict[str, Any]:
+        found = {field.name: getattr(asked, field.name, None) for field in fields(config)}
+        return {name: value for name, value in found.items() if value is not None}
+
+    limits, policy = given(flown.limits), given(flown.policy)
     if asked.policy is not None:  # weights and files of the flight belong to another policy
         policy = {"checkpoint": None, "contract": None} | policy
     return replace(
