@@ -36,7 +36,7 @@ from policy.engines.runner import (
 from policy.engines.torch_eager import modules_of, run_eagerly
 from policy.errors import PolicyError, user_code
 from policy.nets.toge import BuiltinPolicy
-from policy.protocol import PolicyRunner, SingleRatePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
@@ -45,6 +45,9 @@ MAX_OPERATIONS = 4000
 2,700, one is 500."""
 MAX_SCRIPT_OPERATIONS = 20_000
 """Largest number of operations in a TorchScript graph, which counts constants and shapes too."""
+MAX_UNROLLED = 10
+"""Largest number of steps of a built-in network in one graph; each takes a third of a second to
+convert, once."""
 MAX_WEIGHTS = 600_000_000
 """Largest number of weights in one graph, each counted once per use: during conversion every use
 makes a copy of 4 bytes or more. One step of the largest usual diffusion policy has 263 million."""
@@ -58,7 +61,13 @@ def make_module_runner(
     vision: Precision,
     action: Precision,
 ) -> PolicyRunner:
-    """Compile a policy's methods for the loops; tried once."""
+    """Compile a policy's methods for the loops; tried once.
+
+    A short solve of a built-in network is one graph: half the time of a graph for each step.
+    """
+    unrolls = isinstance(policy, BuiltinPolicy) and settings.num_diffusion_steps <= MAX_UNROLLED
+    if not unrolls and isinstance(policy, BuiltinPolicy) and not isinstance(policy, StepwisePolicy):
+        raise PolicyError(f"more than {MAX_UNROLLED} steps are too many for one graph")
 
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
@@ -67,7 +76,7 @@ def make_module_runner(
         *(policy, compile_as(vision), compile_as(action)),
         engine=engine_name(vision, action),
         settings=settings,
-        compile_end=run_eagerly(settings.name, "cpu"),
+        compile_end=None if unrolls else run_eagerly(settings.name, "cpu"),
     )
 
 

@@ -211,7 +211,7 @@ class TogeConfig(BuiltinConfig):
 
 
 class Toge(BuiltinPolicy):
-    """TOGE behind ``protocol.DualRatePolicy``."""
+    """TOGE behind ``protocol.StepwisePolicy``."""
 
     def __init__(self, config: TogeConfig) -> None:
         super().__init__(config)
@@ -235,6 +235,32 @@ class Toge(BuiltinPolicy):
         """Sample a chunk from a cached feature: bit-identical to ``predict`` on its image."""
         require_shape("feature", feature, self.contract.feature_dim)
         return self._sample(feature, state, action_history, num_diffusion_steps)
+
+    @property
+    def schedule(self) -> NoiseSchedule:
+        """The noise schedule of the training."""
+        return self.config.schedule
+
+    @property
+    def initial_noise(self) -> Tensor:
+        """[1, horizon, 4]; fixed for a whole flight."""
+        return self.head.initial_noise
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """Call the network once on noisy actions [B, horizon, 4] at timesteps [B]."""
+        condition = self.condition(feature, self.state_encoder(state), action_history)
+        return self.head.denoise(noisy, timestep, condition)
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """Return the end of a solve as it is."""
+        return sample
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,7 +78,7 @@ class Hooks:
     """Monotonic seconds, for a time budget."""
     report: Callable[[TrainingProgress], None] = lambda _: None
     should_stop: Callable[[], bool] = lambda: False
-    """Polled after every step; True stops the run, which can be resumed."""
+    """Polled after every step; True stops the run, which keeps its best weights."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from policy.engines.openvino_compile import (
     precisions,
     user_cache_folder,
 )
-from policy.engines.openvino_modules import ModuleConverter, make_module_runner
+from policy.engines.openvino_modules import MAX_UNROLLED, ModuleConverter, make_module_runner
 from policy.engines.runner import ExecutionSettings, Precision
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
@@ -59,20 +59,23 @@ def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray
     return chunks_of_samples(reference, samples), chunks_of_samples(runner, samples)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        ResnetUnetConfig(contract=replace(SMALL, since_exposure=True)),
-        TogeConfig(
-            backbone="resnet18",
-            contract=Contract(image_height=32, image_width=48, horizon=8, history_len=2),
-            schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
-        ),
-    ],
-    ids=["resnet-unet", "other-contract"],
+OTHER = TogeConfig(
+    backbone="resnet18",
+    contract=Contract(image_height=32, image_width=48, horizon=8, history_len=2),
+    schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
 )
-def test_single_rate_computes_what_torch_computes(config: BuiltinConfig) -> None:
-    settings = ExecutionSettings(name="toge", num_diffusion_steps=1, dual_rate=False)
+
+
+@pytest.mark.parametrize(
+    ("config", "steps"),
+    [
+        (ResnetUnetConfig(contract=replace(SMALL, since_exposure=True)), 1),
+        (OTHER, 1),
+        (OTHER, MAX_UNROLLED + 1),
+    ],
+)
+def test_single_rate_computes_what_torch_computes(config: BuiltinConfig, steps: int) -> None:
+    settings = ExecutionSettings(name="toge", num_diffusion_steps=steps, dual_rate=False)
     expected, chunks = both(seeded(config), settings)
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
