@@ -109,8 +109,7 @@ class Memory:
         if self.is_act:
             self.refusal = cause.reason  # the act may be repeated
         else:
-            self.failure = cause.reason
-            self.end_request, self.must_stop = cause, True
+            self.failure, self.end_request = cause.reason, cause
 
     def fly(self, now: EngagementInputs, _cause: object) -> None:
         """the policy's actions, starting from the pilot's or idle sticks"""
@@ -132,8 +131,8 @@ class Memory:
         """
         self._note_end(cause)
         self.reason = cause.reason
-        self.must_stop = self.must_stop and cause != self.end_request
-        if cause.end in ("takeover", "disarmed"):
+        self.must_stop = cause != self.end_request
+        if cause.end == "takeover":
             self.seen_interruptions = now.link.interruptions
         self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal
         self.heard_ns = now.now_ns
@@ -158,9 +157,9 @@ class Memory:
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
         """an unconfirmed mode is reported"""
         mode = self.disengage.mode
-        if self.phase is Phase.LEAVING and mode is not None and mode != now.status.mode:
+        if mode is not None and mode != now.status.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
-        self.released_ns, self.owes_release = now.now_ns, True
+        self.released_ns = now.now_ns
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
         """nothing"""

@@ -228,6 +228,7 @@ def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
     assert begun(GROUND, takeoff_m=8.0).is_own_mode(in_guided)
     assert not begun(GROUND).is_own_mode(in_guided)
     assert not begun(AIRBORNE, takeoff_m=8.0).is_own_mode(in_guided)
+    assert begun(AIRBORNE, takeoff_m=8.0).is_up
 
 
 def test_an_act_changes_the_mode_only_where_our_setpoints_are_needed_to_enter_it() -> None:
@@ -248,6 +249,19 @@ def test_the_setpoints_of_a_second_way_in_flow_as_long_as_those_of_the_first() -
     assert not sequence.is_own_mode(altered(facts, mode="OFFBOARD"))
     later = altered(facts, now_ns=FLOW_NS + 2 * NS_PER_S)
     assert sequence.step(later, None).mode is None
+
+
+def test_a_vehicle_without_sticks_that_refuses_the_mode_is_lent_ours_for_this_way_in() -> None:
+    facts = altered(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES, has_receiver=False)
+    sequence = begun(facts, modes=("ALTCTL",))
+    assert sequence.step(facts, None) == Actions(mode="ALTCTL")
+    refused = altered(facts, now_ns=1, refused_mode="ALTCTL")
+    assert sequence.step(refused, None) == Actions(control=NEUTRAL)
+    assert sequence.has_sticks
+    flowed = altered(refused, now_ns=1 + FLOW_NS)
+    assert sequence.step(flowed, None) == Actions(control=NEUTRAL, mode="ALTCTL")
+    sequence.begin(facts)
+    assert not sequence.has_sticks
 
 
 # --- the autopilot's takeoff

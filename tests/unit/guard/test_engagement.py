@@ -203,6 +203,19 @@ def test_the_reason_of_the_way_out_and_who_ended_it_are_both_told() -> None:
     )
 
 
+def test_a_key_on_the_way_in_is_the_whole_reason_and_a_later_act_has_3_s() -> None:
+    stepped = Stepped(altered(ON_GROUND, echo_confirmed=True), arm=True)
+    stepped.run(0.1)
+    stepped.step("release")
+    assert stepped.codes == (Code.OPERATOR,)
+    stepped.run(0.1, is_released=True, armed=True, is_landed=False)
+    stepped.step("engage", is_policy_reset=False)
+    stepped.run(3.0)
+    assert stepped.phase is Phase.PREPARING
+    stepped.step()
+    assert stepped.phase is Phase.RELEASED
+
+
 def test_a_wrong_mode_is_told_with_the_right_ones() -> None:
     stepped = Stepped(altered(AIRBORNE, mode="LOITER"))
     stepped.step("engage")
@@ -254,6 +267,7 @@ def test_each_flight_and_how_it_ended_is_counted() -> None:
     assert stepped.engagement.outcome == disarmed
     stepped.run(0.2, armed=True)
     stepped.step("engage")
+    assert stepped.engagement.outcome == fault._replace(flights=3, end=None)
     stepped.step(mode="LOITER")
     assert stepped.engagement.outcome == fault._replace(flights=3, end="takeover")
 
