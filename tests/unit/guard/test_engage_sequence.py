@@ -217,6 +217,9 @@ def test_which_mode_is_wanted() -> None:
     assert first.wanted_mode(nameless) == "ALT_HOLD"
     assert first.impossibility(nameless) is None
     assert begun(GROUND, mode="LOITER").wanted_mode(GROUND) == "LOITER"
+    names = ", ".join(COPTER_MODES.names)
+    no_such_mode = because(Code.NO_SUCH_MODE, mode="ALTCTL", modes=names)
+    assert begun(GROUND, mode="ALTCTL").impossibility(GROUND) == no_such_mode
     with_loiter_alone = altered(GROUND, modes=replace(COPTER_MODES, names=("LOITER",)))
     assert first.wanted_mode(with_loiter_alone) == "LOITER"
     climbing = altered(GROUND, armed=True, mode="AUTO.TAKEOFF", modes=PX4_MODES)
@@ -229,6 +232,7 @@ def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
     assert not begun(GROUND).is_own_mode(in_guided)
     assert not begun(AIRBORNE, takeoff_m=8.0).is_own_mode(in_guided)
     assert begun(AIRBORNE, takeoff_m=8.0).is_up
+    assert not begun(GROUND, takeoff_m=8.0).is_own_mode(AIRBORNE)
 
 
 def test_an_act_changes_the_mode_only_where_our_setpoints_are_needed_to_enter_it() -> None:
@@ -237,6 +241,7 @@ def test_an_act_changes_the_mode_only_where_our_setpoints_are_needed_to_enter_it
     assert setpoints.may_change_mode(loitering)
     assert not setpoints.may_change_mode(altered(loitering, mode="OFFBOARD"))
     assert not begun(loitering, modes=("ALTCTL",)).may_change_mode(loitering)
+    assert not begun(AIRBORNE, modes=("GUIDED",), is_setpoint=True).may_change_mode(AIRBORNE)
 
 
 def test_the_setpoints_of_a_second_way_in_flow_as_long_as_those_of_the_first() -> None:
