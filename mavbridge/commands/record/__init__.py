@@ -2,5 +2,5 @@
 
 guard process, read-only --ticks, packets--> PilotView --+
 camera --> vision loop, which encodes nothing ----------+--> EpisodeSink --> Recorder, one each
-keys, radio switch, arming --> EpisodeControl --begin, end, mark--> Episodes (folders, marks)
+keys, radio switch, arming --> EpisodeControl --wanted, mark--> Episodes (folders, marks)
 """

@@ -2,7 +2,6 @@
 
 import json
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,25 +55,16 @@ def test_seeds_follow_from_the_evaluations_seed_and_the_index_alone() -> None:
     assert EpisodeSpec(config=last, index=MAX_EPISODES - 1).course_seed < COURSE_SEEDS["race"]
 
 
-@pytest.fixture(scope="module")
-def write_json(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ConditionsKind], bytes]:
-    def write(conditions: ConditionsKind) -> bytes:
-        path = tmp_path_factory.mktemp("evaluation") / "folder" / "results.json"
-        config = EvaluateConfig(
-            policy=CIRCLE, episodes=2, max_time=1.0, conditions=conditions, json=path
-        )
-        assert evaluate(config) == 0
+def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(tmp_path: Path) -> None:
+    def written(conditions: ConditionsKind, folder: str) -> bytes:
+        path = tmp_path / folder / "results.json"
+        short = EvaluateConfig(policy=CIRCLE, episodes=2, max_time=1.0, json=path)
+        assert evaluate(replace(short, conditions=conditions)) == 0
         return path.read_bytes()
 
-    return write
-
-
-def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(
-    write_json: Callable[[ConditionsKind], bytes],
-) -> None:
-    first = write_json("nominal")
-    assert write_json("nominal") == first
-    nominal, random = json.loads(first), json.loads(write_json("random"))
+    first = written("nominal", "first")
+    assert written("nominal", "second") == first
+    nominal, random = json.loads(first), json.loads(written("random", "third"))
     assert nominal["summary"]["outcomes"] == {"timed out": 2}
     assert (nominal["conditions"], random["conditions"]) == ("nominal", "random")
     for a, b in zip(nominal["episodes"], random["episodes"], strict=True):
