@@ -3,13 +3,9 @@
 import pytest
 
 from benchmarks import compare
-from benchmarks.engines import time_engines
 from benchmarks.link import BARE_CLIENT, OUR_CLIENT, time_link
-from mavbridge.config.policy import PolicyConfig
 
 pytestmark = pytest.mark.system
-
-HOVER = PolicyConfig(policy="scripted:hover", dual_rate=False)
 
 
 def test_a_flight_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,11 +14,6 @@ def test_a_flight_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     assert flight["timing"]["sticks"]["lateness_ms"]["p50"] > 0
     assert 0 < flight["cpu_cores"]["guard"] < flight["cpu_cores"]["flight"] * 10
     assert flight["timing"]["action"]["rate_hz"] > 0
-
-
-def test_an_engine_is_timed() -> None:
-    timings = time_engines((HOVER,), rounds=1, block_s=0.05)
-    assert [one.p50_ms > 0 for one in timings] == [True]
 
 
 def test_our_client_answers_the_vehicle_of_the_link_test() -> None:

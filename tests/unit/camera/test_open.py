@@ -1,4 +1,3 @@
-import os
 import sys
 import threading
 from pathlib import Path
@@ -90,22 +89,6 @@ def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s,
     assert ["python -m sitl --camera shm:mb-none" in reason for _, _, reason in said] == [
         second == 2 for second in left_s
     ], "a reason is told once"
-
-
-@needs_shm
-def test_a_segment_that_no_wait_can_mend_ends_the_wait(clock):
-    path, reasons = Path("/dev/shm", f"mb-wrong-{os.getpid()}"), []
-
-    def report(line):
-        reasons.append(line)
-        path.write_bytes(b"no frames")
-
-    try:
-        with pytest.raises(CameraError, match="wrong magic"):
-            open_camera(f"shm:{path.name}", image_size=224, clock=clock, report=report)
-    finally:
-        path.unlink()
-    assert len(reasons) == 1
 
 
 @pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "."])

@@ -119,20 +119,6 @@ def test_a_release_among_other_keys_counts(terminal: Terminal) -> None:
     terminal.until("q")
 
 
-def test_a_failing_receiver_leaves_the_terminal_as_it_was(terminal: Terminal) -> None:
-    def fail(key: str) -> None:
-        terminal.keys.put(key)
-        raise RuntimeError("no use for a key")
-
-    keyboard = Keyboard(fail, fd=terminal.fd)
-    assert keyboard.start()
-    while terminal.keys.empty():
-        terminal.type(b"e")
-        select.select([], [], [], 0.05)
-    with pytest.raises(RuntimeError, match="no use for a key"):
-        keyboard.stop(30.0)
-
-
 def test_the_end_of_the_terminal_ends_the_thread(terminal: Terminal) -> None:
     terminal.start()
     os.close(terminal.user)
