@@ -171,8 +171,7 @@ class Codec:
         """
         payload = kind.unpacker.pack(*values).rstrip(b"\0") or b"\0"
         header = HEADER.pack(
-            *(MARKER_V2, len(payload), 0, 0, self._sequence, *self.source),
-            *(kind.id & 0xFFFF, kind.id >> 16),
+            MARKER_V2, len(payload), 0, 0, self._sequence, *self.source, kind.id, 0
         )
         self._sequence = (self._sequence + 1) % 256
         packet: bytes = header + payload

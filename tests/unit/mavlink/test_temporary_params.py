@@ -113,22 +113,6 @@ def test_arming_while_something_is_put_back_stops_that() -> None:
     assert told(vehicle, "still armed")
 
 
-def test_arming_while_something_is_set_stops_that_until_it_is_disarmed() -> None:
-    vehicle = start()
-    vehicle.refuses.add("RC_OVERRIDE_TIME")
-    while not vehicle.writes:
-        vehicle.step()
-    vehicle.armed = True
-    vehicle.refuses.clear()
-    vehicle.run(5.0)
-    assert vehicle.writes == SET
-    assert vehicle.problem() == because(Code.SET_NEEDS_DISARMING)
-    vehicle.armed = False
-    vehicle.run(1.0)
-    assert vehicle.values["RC_OVERRIDE_TIME"] == 0.5
-    assert vehicle.problem() is None
-
-
 def test_a_vehicle_that_is_gone_at_the_end_is_told() -> None:
     vehicle = start()
     vehicle.run(6.0)
