@@ -12,12 +12,12 @@ from mavbridge.config import episodes, flags, flight, policy, rates
 from mavbridge.config.flags import Ranged
 from mavbridge.core.errors import UserError
 
-CONFIGS = {
+CONFIGS = dict.fromkeys(  # each once, in one order for all test processes
     each
     for module in (commands, episodes, flight, policy, rates)
     for _, each in inspect.getmembers(module, is_dataclass)
     if isinstance(each, type) and issubclass(each, Ranged)
-}
+)
 RANGES = {
     (config, field): (name, limits)
     for config in CONFIGS
