@@ -1,18 +1,17 @@
 """GUIDED and GUIDED_NOGPS: setpoints of a companion computer instead of the pilot's sticks.
 
 Accepted messages, the effect of invalid ones, the timeout and the response times are those measured
-on the firmware. Position setpoints are not simulated; they are dropped.
+on the firmware.
 """
 
 import math
 from enum import Enum, auto
-from typing import NamedTuple
 
 from sitl.ardupilot.control import STEP_S, AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.vehicle.dynamics import BodyState, HeightController, clamp, shorten, thrust_for
-from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import Vec3, from_euler, integrate, to_euler
 
 OPTION_THRUST = 8
@@ -32,13 +31,6 @@ POSITION_GAIN_PER_S = 1.0
 MAX_POSITION_ERROR_M = 2.0
 MAX_LEAN_ACCEL_MPS2 = 5.0
 MIN_CLIMB_ACCEL_MPS2 = 0.5
-
-
-class VelocitySetpoint(NamedTuple):
-    """Velocity and yaw rate of a valid SET_POSITION_TARGET_LOCAL_NED."""
-
-    velocity_ned_mps: Vec3
-    yaw_rate_radps: float
 
 
 class Submode(Enum):

@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.link.server import (
     ACCEPTED,
@@ -29,7 +28,7 @@ from sitl.link.server import (
 )
 from sitl.link.telemetry import Message
 from sitl.report import FlightLog
-from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import from_euler, rotate
 
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)

@@ -22,9 +22,9 @@ from sitl.link.server import MAX_STATUSTEXT, Endpoint, by_message
 from sitl.link.telemetry import Fields, Message, Telemetry
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
-from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Px4Mode
 from sitl.vehicle.config import Px4Release
+from sitl.vehicle.firmware import VelocitySetpoint
 
 CURRENT_MODE = 436
 EVENT = 410
@@ -91,7 +91,7 @@ class Px4Telemetry(Telemetry[Px4]):
     def heartbeat(self) -> Fields:
         """Once a second, so a short change, even an arming, may never show."""
         ap, base_mode = self.ap, self.ap.mode.base_flags
-        if ap.mode is Px4Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
+        if ap.mode is Px4Mode.OFFBOARD and isinstance(ap.setpoint, VelocitySetpoint):
             base_mode |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
         if ap.armed:
             base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
@@ -183,7 +183,7 @@ def topic_version(message_id: int, ap: Px4) -> Hashable:
         return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
         sends_attitude = ap.mode is Px4Mode.OFFBOARD and not isinstance(
-            ap.setpoint, PositionSetpoint
+            ap.setpoint, VelocitySetpoint
         )
         return ap.setpoint_count if sends_attitude else _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:

@@ -1,7 +1,7 @@
 """Control laws of all modes: from mode, sticks, setpoint and state to motor commands."""
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from sitl.px4 import sticks as pilot
 from sitl.px4.control import (
@@ -18,7 +18,7 @@ from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Px4Sticks
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
-from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
@@ -27,16 +27,7 @@ TAKEOFF_CLIMB_MPS = 0.3  # a faster climb demand lifts a landed vehicle off
 ARRIVED_M = 1.0
 
 
-class PositionSetpoint(NamedTuple):
-    """SET_POSITION_TARGET_LOCAL_NED; None where the sender ignores the field."""
-
-    position_ned_m: Vec3 | None
-    velocity_ned_mps: Vec3 | None
-    yaw_rad: float | None
-    yaw_rate_radps: float
-
-
-Setpoint: TypeAlias = AttitudeSetpoint | PositionSetpoint
+Setpoint: TypeAlias = AttitudeSetpoint | VelocitySetpoint
 """Setpoint of a companion computer in OFFBOARD."""
 
 
@@ -96,13 +87,13 @@ class Px4Control:
             return pilot.climb_mps(sticks, self._params) > TAKEOFF_CLIMB_MPS
         if mode is not Px4Mode.OFFBOARD or setpoint is None:
             return False
-        if isinstance(setpoint, PositionSetpoint):
-            return self._offboard_climb_mps(setpoint, body) > TAKEOFF_CLIMB_MPS
+        if isinstance(setpoint, VelocitySetpoint):
+            return self._offboard_climb_mps(setpoint) > TAKEOFF_CLIMB_MPS
         return setpoint.thrust > 0.9 * HOVER_THRUST
 
     @staticmethod
     def is_direct(mode: Px4Mode, setpoint: Setpoint | None) -> bool:
-        is_velocity = isinstance(setpoint, PositionSetpoint)
+        is_velocity = isinstance(setpoint, VelocitySetpoint)
         return mode.manual_throttle or (mode is Px4Mode.OFFBOARD and not is_velocity)
 
     def fly(
@@ -150,25 +141,15 @@ class Px4Control:
                 return self._lean_to(target, rates[2], thrust, body)
             self.attitude = body.ned_from_body_wxyz
             return self._turn_at(rates, thrust, body)
-        north, east, _ = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
-        if setpoint.position_ned_m is not None:
-            gain = self._params["MPC_XY_P"]
-            north += gain * (setpoint.position_ned_m[0] - body.position_ned_m[0])
-            east += gain * (setpoint.position_ned_m[1] - body.position_ned_m[1])
+        north, east, _ = setpoint.velocity_ned_mps
         accel = self._accel_mps2 = self._horizontal.track((north, east), body)
-        climb = self._offboard_climb_mps(setpoint, body)
-        if setpoint.yaw_rad is not None:
-            self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
-        else:
-            yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
+        yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
         yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
-        thrust = self._climb(climb, body)
+        thrust = self._climb(self._offboard_climb_mps(setpoint), body)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body)
 
-    def _offboard_climb_mps(self, setpoint: PositionSetpoint, body: BodyState) -> float:
-        climb = -setpoint.velocity_ned_mps[2] if setpoint.velocity_ned_mps else 0.0
-        if setpoint.position_ned_m is not None:
-            climb += self._params["MPC_Z_P"] * (body.position_ned_m[2] - setpoint.position_ned_m[2])
+    def _offboard_climb_mps(self, setpoint: VelocitySetpoint) -> float:
+        climb = -setpoint.velocity_ned_mps[2]
         return max(-self._params["MPC_Z_VEL_MAX_DN"], min(self._params["MPC_Z_VEL_MAX_UP"], climb))
 
     def _lean_to(

@@ -58,7 +58,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
     | {"MPC_JERK_MAX": 8.0, "MPC_MANTHR_MIN": 0.08, "MPC_THR_HOVER": 0.5, "MPC_THR_MAX": 1.0}
     | {"MPC_THR_MIN": 0.12, "MPC_VEL_MANUAL": 10.0, "MPC_XY_CRUISE": 5.0, "MPC_XY_P": 0.95}
     | {"MPC_XY_TRAJ_P": 0.5, "MPC_XY_VEL_D_ACC": 0.2, "MPC_XY_VEL_I_ACC": 0.4}
-    | {"MPC_XY_VEL_MAX": 12.0, "MPC_XY_VEL_P_ACC": 1.8, "MPC_Z_P": 1.0, "MPC_Z_VEL_MAX_DN": 1.5}
+    | {"MPC_XY_VEL_MAX": 12.0, "MPC_XY_VEL_P_ACC": 1.8, "MPC_Z_VEL_MAX_DN": 1.5}
     | {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_V_AUTO_DN": 1.5, "MPC_Z_V_AUTO_UP": 3.0}
     | {"RTL_MIN_DIST": 10.0, "RTL_RETURN_ALT": 30.0}
 )

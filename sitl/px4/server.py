@@ -22,19 +22,18 @@ from sitl.link.server import (
 from sitl.link.telemetry import Message
 from sitl.px4.autopilot import Px4
 from sitl.px4.endpoint import Px4Endpoint, Px4Telemetry
-from sitl.px4.flight import PositionSetpoint, Setpoint
+from sitl.px4.flight import Setpoint
 from sitl.px4.modes import Px4Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
-from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import Vec3, from_heading
 
 _RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _IGNORE_RATES = 0b111
 _IGNORE_YAW_RATE = 0b100
-_IGNORE_POSITION, _IGNORE_VELOCITY = 0b111, 0b111 << 3
-_IGNORE_YAW, _IGNORE_YAW_SPEED = 1 << 10, 1 << 11
+_IGNORE_VELOCITY, _IGNORE_YAW_SPEED = 0b111 << 3, 1 << 11
 
 
 class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
@@ -116,25 +115,17 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
             self._ap.commander.refuse_frame(frame)
             return
-        velocity: Vec3 | None = (message.vx, message.vy, message.vz)
-        position: Vec3 | None = (message.x, message.y, message.z)
-        is_body = frame == mav.MAV_FRAME_BODY_NED
-        if mask & _IGNORE_VELOCITY or velocity is None:
-            velocity = None
-        elif is_body:
+        if mask & _IGNORE_VELOCITY:
+            return
+        velocity: Vec3 = (message.vx, message.vy, message.vz)
+        if frame == mav.MAV_FRAME_BODY_NED:
             forward, right, down = velocity
             velocity = (*from_heading(forward, right, self._ap.yaw_rad), down)
-        if mask & _IGNORE_POSITION or is_body:
-            position = None
-        if velocity is None and position is None:
-            return
-        yaw = None if mask & _IGNORE_YAW else message.yaw
         yaw_rate = 0.0 if mask & _IGNORE_YAW_SPEED else message.yaw_rate
-        numbers = (*(velocity or ()), *(position or ()), yaw_rate, 0.0 if yaw is None else yaw)
-        if not all(map(math.isfinite, numbers)):
+        if not all(map(math.isfinite, (*velocity, yaw_rate))):
             self._log.refused_messages += 1
             return
-        self._follow(PositionSetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
+        self._follow(VelocitySetpoint(velocity, yaw_rate), arrived_ns)
 
     def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
         self._ap.set_setpoint(setpoint, arrived_ns)

@@ -39,6 +39,13 @@ class AttitudeSetpoint(NamedTuple):
     thrust: float  # PX4: collective, 0..1; ArduPilot: as GUID_OPTIONS says
 
 
+class VelocitySetpoint(NamedTuple):
+    """Velocity and yaw rate of a valid SET_POSITION_TARGET_LOCAL_NED; positions are dropped."""
+
+    velocity_ned_mps: Vec3
+    yaw_rate_radps: float
+
+
 class HeldGesture:
     """Stick gesture to one of two sides, 1 or -1, that acts once after it was held."""
 

@@ -33,17 +33,22 @@ from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process
 from mavbridge.simulation.network import DelayedChannel
-from mavbridge.simulation.world import NOMINAL_VEHICLE
+from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, STEP_NS, VehicleConfig
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
 
 MS = NS_PER_MS
-HEIGHT_M = 10.0
+ALOFT = AirborneStart(
+    position_ned_m=(0.0, 0.0, -10.0),
+    velocity_ned_mps=(0.0, 0.0, 0.0),
+    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+    next_gate=0,
+)
 SIGNAL = because(Code.SIGNAL)
 NAN = (math.nan,) * 4
 HOVER = (0.0, 0.0, 0.0, 0.0)
@@ -114,7 +119,9 @@ class GuardFlight:
             FlyConfig(link=LinkConfig(connect="memory", **(link or {})), **config),
             contract,
         )
-        self.clock.schedule(self.clock.now_ns() + STEP_NS, self._step_vehicle)
+        ends = {"to_vehicle": self.up, "from_vehicle": self.down}
+        stepper = VehicleStepper(self.clock, self.vehicle, self.clock.now_ns(), **ends)
+        stepper.watchers.append(self._after_step)
 
     def _compose(self, config: FlyConfig, contract: Contract) -> None:
         hop_ns = iter(lambda: NS_PER_MS // 10, None)
@@ -219,15 +226,9 @@ class GuardFlight:
 
     # --- time
 
-    def _step_vehicle(self) -> None:
-        now_ns = self.clock.now_ns()
-        for arrived_ns, data in self.up.receive():
-            self.vehicle.receive(0, data, arrived_ns)
-        self.vehicle.step(now_ns)
+    def _after_step(self) -> None:
+        """Called after each step of the vehicle; other stations read nothing."""
         self.vehicle.take_outgoing(1)
-        if outgoing := self.vehicle.take_outgoing(0):
-            self.down.send(outgoing)
-        self.clock.schedule(now_ns + STEP_NS, self._step_vehicle)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
@@ -269,14 +270,7 @@ class GuardFlight:
 
     def launch(self, mode: Mode = Mode.ALT_HOLD) -> "GuardFlight":
         """Hover armed under the pilot, with the link ready and the policy fresh."""
-        self.vehicle.launch(
-            AirborneStart(
-                position_ned_m=(0.0, 0.0, -HEIGHT_M),
-                velocity_ned_mps=(0.0, 0.0, 0.0),
-                ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-                next_gate=0,
-            )
-        )
+        self.vehicle.launch(ALOFT)
         self.ap.set_mode(mode)
         self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=8)
         return self
@@ -391,12 +385,12 @@ class GuardFlight:
 
     def pilot_mode(self, number: int) -> None:
         """Change the mode as a pilot at a ground station."""
-        self.station(
-            lambda mav: mav.command_long_encode(
-                1, 1, dialect.MAV_CMD_DO_SET_MODE, 0, 1, number, 0, 0, 0, 0, 0
-            ),
-            system=42,
-        )
+        self.command(dialect.MAV_CMD_DO_SET_MODE, 1, number)
+
+    def command(self, number: int, *params: float) -> None:
+        """Send a COMMAND_LONG of another station."""
+        values = [*params, *[0.0] * (7 - len(params))]
+        self.station(lambda mav: mav.command_long_encode(1, 1, number, 0, *values), system=42)
 
     def station(
         self, encode: Callable[[dialect.MAVLink], dialect.MAVLink_message], *, system: int = 255

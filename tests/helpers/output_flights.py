@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.guard_flights import HEIGHT_M, GuardFlight
+from helpers.guard_flights import ALOFT, GuardFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
@@ -22,11 +22,10 @@ from policy.protocol import PolicyRunner
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode
-from sitl.course import AirborneStart
 from sitl.px4.autopilot import Px4
-from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Px4Mode
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
+from sitl.vehicle.firmware import VelocitySetpoint
 from sitl.vehicle.rotation import Quat, cos_tilt
 
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
@@ -152,14 +151,7 @@ class OutputFlight(GuardFlight):
 
     def put_in_air(self) -> None:
         """Hover armed under the pilot, from any state of the vehicle."""
-        self.vehicle.launch(
-            AirborneStart(
-                position_ned_m=(0.0, 0.0, -HEIGHT_M),
-                velocity_ned_mps=(0.0, 0.0, 0.0),
-                ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-                next_gate=0,
-            )
-        )
+        self.vehicle.launch(ALOFT)
         self.run(0.6)  # its estimator has a position by then
         if not self.is_px4:
             assert self.ardupilot.set_mode(ArduMode[self.mode])
@@ -216,11 +208,6 @@ class OutputFlight(GuardFlight):
             f"{ap.armed}, height {self.height_m:.1f} m, {self.messages}"
         )
 
-    def command(self, number: int, *params: float, system: int = 42) -> None:
-        """Send a COMMAND_LONG of another station."""
-        values = [*params, *[0.0] * (7 - len(params))]
-        self.station(lambda mav: mav.command_long_encode(1, 1, number, 0, *values), system=system)
-
     def pilot_changes_mode(self) -> str:
         """Take over as a pilot at a ground station, in a mode that holds; return its name."""
         main, sub = (4, 3) if self.is_px4 else (ArduMode.LOITER.value, 0)
@@ -238,17 +225,14 @@ class OutputFlight(GuardFlight):
         """Seconds since boot: the time of the record."""
         return self.samples[-1].t_s
 
-    def _step_vehicle(self) -> None:
-        before_ns = self.vehicle.ap.now_ns
-        super()._step_vehicle()
-        if self.vehicle.ap.now_ns != before_ns:
-            self.samples.append(self._sample())
-
-    def _sample(self) -> Sample:
+    def _after_step(self) -> None:
+        super()._after_step()
         ap = self.vehicle.ap
-        body = ap.truth
-        return Sample(
-            t_s=(ap.now_ns - self._boot_ns) / NS_PER_S,
+        body, t_s = ap.truth, (ap.now_ns - self._boot_ns) / NS_PER_S
+        if self.samples and self.samples[-1].t_s == t_s:  # PX4 steps every 4 ms
+            return
+        sample = Sample(
+            t_s=t_s,
             mode=ap.mode_name,
             armed=ap.armed,
             failsafe=ap.in_failsafe,
@@ -256,6 +240,7 @@ class OutputFlight(GuardFlight):
             lean_deg=math.degrees(_tilt_rad(body.ned_from_body_wxyz)),
             position_ned_m=body.position_ned_m,
         )
+        self.samples.append(sample)
 
     def _is_neutral(self) -> bool:
         if self.kind == "sticks":
@@ -265,8 +250,8 @@ class OutputFlight(GuardFlight):
     def _is_setpoint_neutral(self) -> bool:
         if self.is_px4:
             setpoint: Any = self.px4.setpoint
-            if isinstance(setpoint, PositionSetpoint):
-                return math.hypot(*(setpoint.velocity_ned_mps or ())) < NEUTRAL_MPS
+            if isinstance(setpoint, VelocitySetpoint):
+                return math.hypot(*setpoint.velocity_ned_mps) < NEUTRAL_MPS
             attitude = setpoint.ned_from_body_wxyz if setpoint is not None else None
             return attitude is not None and _tilt_rad(attitude) < NEUTRAL_TILT_RAD
         guided = self.ardupilot.guided
