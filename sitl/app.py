@@ -32,6 +32,7 @@ JOIN_TIMEOUT_S = 5.0
 KEY_BYTES = 32
 EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
 """Unix time of the epoch of MAVLink 2 signing timestamps."""
+RECEIVERS = {"idle": IDLE_RECEIVER_US, "mid": MID_RECEIVER_US, "none": None}
 LEAST_PRIORITY = 19
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
 
@@ -175,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--fly-on", type=_POSITIVE, default=0.0, metavar="S", help=fly_on_help)
     receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
     receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
-    add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
+    add("--receiver", choices=tuple(RECEIVERS), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/transport.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
     pilot_help = "a gamepad, or the expert over the course moves the receiver"
@@ -263,8 +264,7 @@ def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig
     return VehicleConfig(
         autopilot=args.autopilot,
         onboard_links=frozenset(range(links, links + onboard)),
-        receiver=receiver != "none",
-        receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
+        receiver_us=RECEIVERS[receiver],
         signing=args.signing_key_file and _signing_key(args.signing_key_file),
     )
 

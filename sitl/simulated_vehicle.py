@@ -50,7 +50,9 @@ class SimulatedVehicle:
         self.server: MavlinkServer[Any, Any]  # the vehicle's links
         if config.autopilot == "px4":
             self.params = Px4Params(
-                config.conditions, receiver=config.receiver, release=config.px4_release
+                config.conditions,
+                receiver=config.receiver_us is not None,
+                release=config.px4_release,
             )
         else:
             self.params = ArduPilotParams(config.conditions, config.ardupilot_release)

@@ -117,7 +117,7 @@ class ArduCopter(Autopilot):
     def __init__(self, params: ArduPilotParams, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
         self.mode = Mode.STABILIZE
-        self.rc = RcEngine(params, config.receiver_us if config.receiver else None)
+        self.rc = RcEngine(params, config.receiver_us)
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)

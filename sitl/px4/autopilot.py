@@ -39,13 +39,13 @@ class Px4(Autopilot):
         super().__init__(params, config, boot_ns)
         self.stick_input = StickInput(params)
         self.commander = Commander(params, self.stick_input, boot_ns, self.texts)
-        self.receiver_us: tuple[int, ...] | None = config.receiver_us if config.receiver else None
+        self.receiver_us = config.receiver_us
         """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
         self.setpoint: Setpoint | None = None
         self.setpoint_count = 0
         self.flight = Px4Control(params)
         self._setpoint_ns = boot_ns
-        self._has_transmitter = config.receiver
+        self._has_transmitter = config.receiver_us is not None
         self._receiver_due_ns = boot_ns
         self._ramp_ns: int | None = None  # start of the takeoff ramp; None: no ramp
         self._flown_mode = self.mode

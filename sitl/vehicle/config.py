@@ -38,11 +38,9 @@ class VehicleConfig:
     autopilot: AutopilotName = "ardupilot"
     ardupilot_release: ArduPilotRelease = "4.7-dev"
     px4_release: Px4Release = "1.18"
-    receiver: bool = True
-    """True: an RC receiver is present. Without one, ArduCopter's sticks latch and its radio fails;
-    PX4 uses it only if COM_RC_IN_MODE says so."""
-    receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
-    """Receiver channels at boot [us]."""
+    receiver_us: tuple[int, ...] | None = IDLE_RECEIVER_US
+    """Channels of the RC receiver at boot [us]; None: no receiver. Without one, ArduCopter's sticks
+    latch and its radio fails; PX4 uses it only if COM_RC_IN_MODE says so."""
     estimator_ready_s: float = 3.0
     """Time from boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0

@@ -88,7 +88,7 @@ def _peer(request: pytest.FixtureRequest, autopilot: AutopilotName, *, receiver:
     if EXTERNAL in request.config.stash:
         return request.config.stash[EXTERNAL].peer
     return MockPeer(
-        VehicleConfig(autopilot=autopilot, receiver=receiver, receiver_us=IDLE_RECEIVER_US)
+        VehicleConfig(autopilot=autopilot, receiver_us=IDLE_RECEIVER_US if receiver else None)
     )
 
 

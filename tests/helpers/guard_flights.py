@@ -40,7 +40,7 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, VehicleConfig
+from sitl.vehicle.config import MID_RECEIVER_US, VehicleConfig
 
 MS = NS_PER_MS
 ALOFT = AirborneStart(
@@ -105,11 +105,7 @@ class GuardFlight:
         self.vehicle = SimulatedVehicle(
             links=2,
             boot_ns=self.clock.now_ns(),
-            config=replace(
-                vehicle,
-                receiver=receiver_us is not None,
-                receiver_us=receiver_us or IDLE_RECEIVER_US,
-            ),
+            config=replace(vehicle, receiver_us=receiver_us),
         )
         for name, value in (params or {}).items():
             assert self.vehicle.params.set(name, value), name

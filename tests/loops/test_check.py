@@ -42,8 +42,7 @@ class Bench:
             config=replace(
                 NOMINAL_VEHICLE,
                 autopilot=autopilot,
-                receiver=receiver,
-                receiver_us=MID_RECEIVER_US,
+                receiver_us=MID_RECEIVER_US if receiver else None,
             ),
         )
         for name, value in (params or {}).items():

@@ -7,7 +7,7 @@ import pytest
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.conditions import NOMINAL
-from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.config import IDLE_RECEIVER_US, VehicleConfig
 from sitl.vehicle.rotation import from_euler
 
 
@@ -103,7 +103,7 @@ def test_a_lost_position_levels_the_vehicle_and_refuses_position_modes(pilot):
 )
 def test_a_parameter_selects_the_mode_of_a_failsafe(pilot, parameter, choice, mode):
     is_of_gcs = parameter == "FS_GCS_ENABLE"
-    pilot = type(pilot)(VehicleConfig(receiver=is_of_gcs))
+    pilot = type(pilot)(VehicleConfig(receiver_us=IDLE_RECEIVER_US if is_of_gcs else None))
     pilot.ap.params.set(parameter, float(choice))
     pilot.ap.params.set("FS_OPTIONS", 0.0)
     pilot.take_off()
@@ -114,7 +114,7 @@ def test_a_parameter_selects_the_mode_of_a_failsafe(pilot, parameter, choice, mo
 
 @pytest.mark.parametrize("lifts_off", [False, True])
 def test_a_radio_failsafe_on_the_ground_disarms_and_without_a_position_lands(pilot, lifts_off):
-    pilot = type(pilot)(VehicleConfig(receiver=False))
+    pilot = type(pilot)(VehicleConfig(receiver_us=None))
     pilot.hold(3.2, thr=1000)
     pilot.ap.set_mode(Mode.ALT_HOLD)
     assert pilot.ap.arm(force=False)

@@ -7,7 +7,7 @@ from helpers.contract_peers import last, named
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import VehicleConfig
 
-WITHOUT_RECEIVER = VehicleConfig(receiver=False, estimator_ready_s=0.0, position_ready_s=0.0)
+WITHOUT_RECEIVER = VehicleConfig(receiver_us=None, estimator_ready_s=0.0, position_ready_s=0.0)
 RECEIVER = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 
 

@@ -23,7 +23,7 @@ DOWN = Hand(CENTRED._replace(throttle=-1.0))
 
 
 def vehicle_of(autopilot, **changes):
-    config = VehicleConfig(autopilot=autopilot, receiver=True, **changes)
+    config = VehicleConfig(autopilot=autopilot, **changes)
     made = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
     prepare_vehicle(made)
     return made

@@ -7,7 +7,9 @@ import pytest
 from helpers.ends import Ends
 from sitl.vehicle.config import VehicleConfig
 
-READY = VehicleConfig(autopilot="px4", receiver=False, estimator_ready_s=0.0, position_ready_s=0.0)
+READY = VehicleConfig(
+    autopilot="px4", receiver_us=None, estimator_ready_s=0.0, position_ready_s=0.0
+)
 
 
 @pytest.fixture
