@@ -6,9 +6,7 @@ from hypothesis import strategies as st
 
 from helpers.wire import ARDUPILOT
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks
-from mavbridge.mavlink.codec.calibration import (
-    RcChannel,
-)
+from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
 
 
 @pytest.mark.parametrize(
@@ -24,6 +22,15 @@ from mavbridge.mavlink.codec.calibration import (
 )
 def test_sticks_to_pwm(sticks: Sticks, throttle_yaw_pitch_roll_us: tuple[int, ...]) -> None:
     assert ARDUPILOT.to_pwm_us(sticks) == throttle_yaw_pitch_roll_us
+
+
+def test_a_calibration_has_a_channel_for_each_stick_and_by_default_no_failsafe() -> None:
+    throttle, yaw, pitch, roll = ARDUPILOT.channels
+    ours = RcCalibration(throttle=throttle, yaw=yaw, pitch=pitch, roll=roll)
+    assert ours.throttle_floor_us == 0
+    assert ours.to_pwm_us(Sticks(0.5, 0.25, -0.5, -0.25)) == (1700, 1600, 1700, 1400)
+    with pytest.raises(ValueError, match="two sticks on one channel"):
+        replace(ours, yaw=replace(yaw, number=3))
 
 
 def test_an_uneven_and_reversed_channel() -> None:

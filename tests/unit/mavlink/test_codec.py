@@ -35,6 +35,7 @@ from mavbridge.mavlink.codec.messages import (
     ParamWrite,
     RcChannels,
     SpecificForce,
+    StampOrder,
     StatusText,
     StreamRequest,
     SystemStatus,
@@ -508,6 +509,25 @@ def test_a_stamp_is_later_across_a_wrap_and_after_a_restart_earlier(
     stamp_us: int, other_us: int, later_us: int
 ) -> None:
     assert later_by_us(stamp_us, other_us) == later_us
+
+
+@pytest.mark.parametrize(
+    ("stamps_us", "accepted"),
+    [
+        ([5, 6, 6, 5, 7], [True, True, False, False, True]),
+        ([1, 1], [True, False]),
+        ([7, 0, 5], [True, True, True]),  # 0 is no stamp
+        ([2**32 * 1000 - 10, 5, 2**32 * 1000 - 5], [True, True, False]),  # across a wrap
+        ([10**7, 9 * 10**6, 9 * 10**6], [True, False, False]),  # late by no more than a second
+        # Two far back in a row are a clock that has restarted.
+        ([10**7, 10**6, 9_900_000, 10**6, 10**6 + 1], [True, False, False, False, True]),
+    ],
+)
+def test_late_and_doubled_stamps_are_left_out_until_the_clock_has_restarted(
+    stamps_us: list[int], accepted: list[bool]
+) -> None:
+    order = StampOrder()
+    assert all(order.accepts(us) is wanted for us, wanted in zip(stamps_us, accepted, strict=True))
 
 
 def test_what_a_record_is_not_told_is_zero() -> None:
