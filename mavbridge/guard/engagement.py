@@ -123,7 +123,7 @@ class Engagement(Memory):
             self.phase = Phase.ENDED
             return Actions()
         problem = objection(self, now)
-        if self.phase is Phase.FLYING or self.starting_ns is None:
+        if self.starting_ns is None:
             problem = problem or now.chunk_problem
         if problem is not None:
             self.phase, self.reason = Phase.WAITING, problem

@@ -1,13 +1,23 @@
 """The engagement beyond single rows: acts of switch and arming, what is counted, what is told."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, altered, engagement_settings, flying
-from mavbridge.core.clock import NS_PER_S
+from helpers.guard_facts import (
+    AIRBORNE,
+    ON_GROUND,
+    PX4_MODES,
+    Stepped,
+    altered,
+    engagement_settings,
+    flying,
+)
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest, Outcome, Phase
 
@@ -314,7 +324,8 @@ def test_readonly_waits_for_the_policys_reset_and_stops_at_an_objection() -> Non
     assert stepped.engagement.starting_ns == began_ns
     assert stepped.step(is_policy_reset=True) == NOTHING
     assert stepped.step(chunk_problem=None) == FLIES
-    assert stepped.step(problem=because(lost), chunk_problem=late) == NOTHING
+    assert stepped.step(problem=because(lost)) == NOTHING
+    assert stepped.step(chunk_problem=late) == NOTHING
     assert stepped.codes == (lost,)
 
 
@@ -325,7 +336,8 @@ def test_the_first_chunk_after_a_reset_may_take_two_periods_more() -> None:
     stepped.step("engage", is_policy_reset=False)
     stepped.run(5.0)
     assert stepped.phase is Phase.PREPARING
-    stepped.step()
+    stepped.step(problem=because(Code.HEARTBEAT_LOST))
+    assert stepped.engagement.starting_ns is None
     assert stepped.phase is not Phase.PREPARING
 
 
@@ -339,3 +351,64 @@ def test_watching_ends_as_a_flight_does(ends: str) -> None:
     assert set(stepped.run(1)) == {FLIES}
     assert stepped.step(stop=DEATH if ends == "stop" else None) == NOTHING
     assert stepped.phase is Phase.ENDED
+
+
+# --- last words
+
+
+NEUTRAL = ControlSource.NEUTRAL
+IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
+PX4 = altered(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
+FIRST_MS = (0, 20, 40, 100, 150, 200, 250)
+
+
+def asking(mode: str, at_ms: tuple[int, ...], times_ms: tuple[int, ...] = FIRST_MS) -> list[Any]:
+    return [(ms, NEUTRAL, mode if ms in at_ms else None) for ms in times_ms]
+
+
+def releasing(from_ms: int) -> list[Any]:
+    return [(from_ms + k * 50, ControlSource.RELEASE, None) for k in range(5)]
+
+
+def left_by_key() -> Stepped:
+    stepped = flying(NO_RECEIVER)
+    stepped.step("release")
+    stepped.run(0.2, mode="LAND")
+    return stepped
+
+
+def left_by_fault() -> Stepped:
+    stepped = flying(IDLE_RECEIVER)
+    stepped.step(**FAULT)
+    return stepped
+
+
+def asked() -> Stepped:
+    stepped = Stepped(altered(AIRBORNE, mode="LOITER", is_released=True), mode="ALT_HOLD")
+    stepped.step()
+    stepped.step("engage")
+    return stepped
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (lambda: flying(IDLE_RECEIVER), asking("BRAKE", (0, 100, 200)) + releasing(250)),
+        (left_by_fault, asking("BRAKE", (0, 100, 200)) + releasing(250)),
+        (lambda: flying(NO_RECEIVER), asking("BRAKE", (0, 100, 200))),
+        (flying, asking("", (), (0, 20, 40)) + releasing(100)),
+        (left_by_key, asking("LAND", ())),
+        (asked, []),
+        (
+            lambda: flying(PX4),
+            asking("AUTO.LOITER", (1000, 1100, 1200), (0, 20, 40, *range(100, 1251, 50))),
+        ),
+    ],
+)
+def test_the_words_of_a_guard_that_dies(start: Callable[[], Stepped], words: list[Any]) -> None:
+    stepped = start()
+    now_ns = stepped.facts.now_ns
+    facts = altered(stepped.facts, heard_ns=now_ns, mode_arrived_ns=now_ns)
+    said = stepped.engagement.rehearse(facts)
+    found = [(after_ns // NS_PER_MS, move.control, move.mode) for after_ns, move in said]
+    assert found == words
