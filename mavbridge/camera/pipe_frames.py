@@ -21,7 +21,7 @@ _SOI, _EOI, _SOS, _FILL = b"\xff\xd8", 0xD9, 0xDA, 0xFF
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 """Markers of the segment that contains a JPEG's size."""
 _SIDES = struct.Struct(">HH")
-_PNG, _IEND = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_PNG = b"\x89PNG\r\n\x1a\n"
 _IHDR = struct.Struct(">16xIIBB")
 """Width, height, bits per sample and colour type (0: grey) of a PNG."""
 _START = re.compile(re.escape(_SOI) + b"|" + re.escape(_PNG))
@@ -158,7 +158,23 @@ class RawCutter(FrameCutter):
 class PictureCutter(FrameCutter):
     """Cutter for consecutive JPEG or PNG pictures, with or without multipart headers."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._at = 0
+        """Position at which the search continues; 0 until a picture's start is found."""
+        self._in_scan = self._is_png = False
+
     def _find_end(self, arrived_ns: int) -> int | None:
+        if self._at == 0 and not self._find_start(arrived_ns):
+            return None
+        if not (self._find_png_end() if self._is_png else self._find_jpeg_end()):
+            if len(self._buffer) > MAX_JPEG_BYTES:
+                raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
+            return None
+        end, self._at, self._in_scan = self._at, 0, False
+        return end
+
+    def _find_start(self, arrived_ns: int) -> bool:
         start = _START.search(self._buffer)
         if start is None:
             if len(self._buffer) > MAX_BETWEEN_BYTES:
@@ -167,15 +183,51 @@ class PictureCutter(FrameCutter):
                     f"its output is no MJPEG and no PNG: it begins with {begin}; for raw pictures "
                     "write pipe:WIDTHxHEIGHT:FORMAT:COMMAND"
                 )
-            return None
-        is_png = start[0] == _PNG
-        if start.start():
-            self._first_ns = arrived_ns
-            del self._buffer[: start.start()]
-        end = _png_end(self._buffer) if is_png else _jpeg_end(self._buffer)
-        if end is None and len(self._buffer) > MAX_JPEG_BYTES:
-            raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
-        return end
+            return False
+        self._at, self._first_ns = len(start[0]), arrived_ns
+        self._is_png = start[0] == _PNG
+        del self._buffer[: start.start()]
+        return True
+
+    def _find_jpeg_end(self) -> bool:
+        """Walk over the segments of the picture. Return True if it ends at ``_at``."""
+        buffer = self._buffer
+        while True:
+            if self._in_scan:
+                match = _MARKER.search(buffer, self._at)
+                if match is None:
+                    self._at = max(self._at, len(buffer) - 1)
+                    return False
+                self._at, self._in_scan = match.start(), False
+            if len(buffer) < self._at + 2:
+                return False
+            marker = buffer[self._at + 1]
+            if buffer[self._at] != 0xFF:
+                raise CameraError("its output is no MJPEG, or a damaged one")
+            if marker == _EOI:
+                self._at += 2
+                return True
+            if marker == _FILL:
+                self._at += 1
+                continue
+            if len(buffer) < self._at + 4:
+                return False
+            length = int.from_bytes(buffer[self._at + 2 : self._at + 4], "big")
+            if len(buffer) < self._at + 2 + length:
+                return False
+            self._at += 2 + length
+            self._in_scan = marker == _SOS
+
+    def _find_png_end(self) -> bool:
+        """Walk over the chunks of the picture. Return True if it ends at ``_at``."""
+        buffer, kind = self._buffer, b""
+        while kind != b"IEND":
+            kind = bytes(buffer[self._at + 4 : self._at + 8])
+            end = self._at + 12 + int.from_bytes(buffer[self._at : self._at + 4], "big")
+            if len(kind) < 4 or end > len(buffer):
+                return False
+            self._at = end
+        return True
 
     def decode(self, frame: bytes) -> CameraImage | None:
         """See `FrameCutter`."""
@@ -184,27 +236,3 @@ class PictureCutter(FrameCutter):
     def rest(self) -> str:
         """See `FrameCutter`."""
         return "; its last picture was cut off" if self._buffer else ""
-
-
-def _jpeg_end(data: bytearray) -> int | None:
-    """Return the length of the JPEG at the front, whose segments may hold another one, or None."""
-    at = len(_SOI)
-    while at + 2 <= len(data):
-        marker = data[at + 1]
-        if data[at] != _FILL:
-            raise CameraError("its output is no MJPEG, or a damaged one")
-        if marker == _EOI:
-            return at + 2
-        at += 1 if marker == _FILL else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker == _SOS:
-            scan_end = _MARKER.search(data, at)
-            if scan_end is None:
-                return None
-            at = scan_end.start()
-    return None
-
-
-def _png_end(data: bytearray) -> int | None:
-    """Return the length of the PNG at the front, or None."""
-    end = data.find(_IEND)
-    return None if end < 0 else end + len(_IEND)
