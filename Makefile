@@ -19,6 +19,8 @@ AUTOPILOT ?= ardupilot
 BRIEF := $(if $(filter ardupilot,$(AUTOPILOT)),--set RC_OVERRIDE_TIME=0.5 --set GUID_TIMEOUT=0.5)
 # ArduPilot takes the thrust of body rates for a climb rate without this.
 BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUID_OPTIONS=8)
+# One viewer a flight: FLAGS="--rerun connect" shows it and writes no file.
+SAVED := $(if $(findstring --rerun,$(FLAGS)),,--rerun out/flight.rrd)
 LANDED := $(if $(findstring --then,$(FLAGS)),,--then land)
 SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
@@ -67,9 +69,10 @@ fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flyi
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
 		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(LANDED) $(BRIEF) $(BY_RATES) $(FLAGS) \
-		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
+		$(SAVED) --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
-	[ ! -e out/report.json ] || echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
+	[ ! -e out/report.json ] || echo "wrote out/report.json and out/fc.json"; \
+	[ ! -e out/flight.rrd ] || echo "wrote out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
 	exit $$status
 
 lint: $(VENV)/installed  ## format, lint, types, import direction

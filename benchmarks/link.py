@@ -31,7 +31,7 @@ class LinkClient(NamedTuple):
     """Program that answers each attitude with sticks."""
 
     name: str
-    command: str
+    command: tuple[str, ...]
     """With {port} for its UDP port."""
 
 
@@ -39,16 +39,21 @@ class LinkClient(NamedTuple):
 # twice its rate, so that an attitude closely after a late one is answered at once.
 OUR_CLIENT = LinkClient(
     "mavbridge",
-    f"{sys.executable} -m mavbridge --connect udp:127.0.0.1:{{port}} --camera none --arm "
-    f"--policy {Path(__file__).parent / 'link_policy.py'}:RollRate --dual-rate "
-    "--on-fault release --then release --set-config limits.tau=0 --set-config limits.slew=0 "
-    "--set-config limits.frozen_state=0 --set-config rates.action=200",
+    (
+        *(sys.executable, "-m", "mavbridge", "--connect", "udp:127.0.0.1:{port}"),
+        *("--policy", f"{Path(__file__).parent / 'link_policy.py'}:RollRate", "--dual-rate"),
+        *("--camera", "none", "--arm", "--on-fault", "release", "--then", "release"),
+        *("--set-config", "limits.tau=0", "--set-config", "limits.slew=0"),
+        *("--set-config", "limits.frozen_state=0", "--set-config", "rates.action=200"),
+    ),
 )
 BARE_CLIENT = LinkClient(
-    "bare pymavlink loop", f"{sys.executable} -m benchmarks.link_pymavlink --port {{port}}"
+    "bare pymavlink loop",
+    (sys.executable, "-m", "benchmarks.link_pymavlink", "--port", "{port}"),
 )
 MAVSDK_CLIENT = LinkClient(
-    "MAVSDK-Python 4", f"{PEERS_PYTHON} -m benchmarks.link_mavsdk --port {{port}}"
+    "MAVSDK-Python 4",
+    (str(PEERS_PYTHON), "-m", "benchmarks.link_mavsdk", "--port", "{port}"),
 )
 
 
@@ -100,7 +105,7 @@ def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         folder = Path(name)
         log, vehicle_log, answers = (folder / file for file in ("client", "vehicle", "answers"))
-        client_command = client.command.format(port=port).split()
+        client_command = [word.format(port=port) for word in client.command]
         vehicle_command = (
             *(sys.executable, "-m", LINK_VEHICLE, "--port", port),
             *("--attitudes", str(attitudes), "--out", str(answers)),

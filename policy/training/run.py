@@ -53,6 +53,7 @@ def work_folder(settings: RunSettings) -> Iterator[Path]:
     try:
         folder.mkdir(exist_ok=True)
         (folder / "log.jsonl").unlink(missing_ok=True)
+        shutil.rmtree(folder / "data", ignore_errors=True)  # of a run that was killed
         yield folder
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -111,6 +112,7 @@ class TrainingRun(ABC, Generic[M, B]):
             settings.image_size,
             progress=lambda done: self.report_work(f"decoding, {done:.0%}"),
         )
+        self._begun_s = hooks.now_s()
 
     # ---- for subclasses ----
 
@@ -168,8 +170,6 @@ class TrainingRun(ABC, Generic[M, B]):
             if not stage.trains_encoder:
                 self._freeze_encoder()
             self._train(stage)
-        if self.encoder_learns_alone and self.step == self._stage_step:
-            raise TrainingError("encoding took all the time that was left: give more --minutes")
         self._validate(self.stages[-1])
         return TrainResult(checkpoint=self.settings.out, steps=self.step, validation=self._best)
 
@@ -177,7 +177,9 @@ class TrainingRun(ABC, Generic[M, B]):
         """Train on features of the average encoder from now on."""
         self.trainee.load_state_dict(self.average.state_dict())
         self.trainee.eval()
+        encoding_s = self.hooks.now_s()
         self.encode()
+        self._begun_s += self.hooks.now_s() - encoding_s
         self.average.load_state_dict(self.trainee.state_dict())
 
     def _train(self, stage: TrainingStage) -> None:
@@ -204,7 +206,8 @@ class TrainingRun(ABC, Generic[M, B]):
                     self._validations = due
                     self._validate(stage)
                 if self.hooks.should_stop():
-                    self._validate(stage)
+                    if self._is_exported or not self.settings.out.exists():
+                        self._validate(stage)
                     self._stop()
 
     def _set_gradients(self, batch: B) -> dict[str, Tensor]:

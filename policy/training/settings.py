@@ -43,7 +43,8 @@ class RunSettings:
     out: Path
     """Checkpoint to write (.safetensors); the log of the run is kept beside it."""
     minutes: float | None = None
-    """Length of the training; 45 if neither this nor --steps is given."""
+    """Length of the training, without decoding and encoding the images; 45 if neither this nor
+    --steps is given."""
     steps: int | None = None
     """Length of the training in optimiser steps, in place of --minutes."""
     image_size: int = 96

@@ -70,5 +70,8 @@ class WorldModelConfig:
             data["schedule"] = NoiseSchedule(**data["schedule"])
             data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
             return cls(contract=contract, **data)
-        except (PolicyError, LookupError, TypeError, ValueError, RecursionError) as error:
+        except (
+            *(PolicyError, ArithmeticError, LookupError),
+            *(TypeError, ValueError, RecursionError),
+        ) as error:
             raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error

@@ -103,6 +103,14 @@ def test_equal_runs_give_equal_weights_and_a_stopped_run_keeps_its_best(flights,
     assert [path.name for path in asked.work_folder.iterdir()] == ["log.jsonl"]
 
 
+def test_a_run_stopped_before_its_first_validation_overwrites_nothing(flights, tmp_path):
+    asked = settings(tmp_path)
+    asked.out.write_bytes(b"of an earlier run")
+    with pytest.raises(TrainingStoppedError, match="nothing is kept"):
+        train_policy(flights, NETWORK, asked, make_hooks(should_stop=asked.work_folder.exists))
+    assert asked.out.read_bytes() == b"of an earlier run"
+
+
 def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
     network = ResnetUnetConfig(contract=CONTRACT)
     changes = {"gate_weight": 0.0, "mirror": False, "validations": 1, "steps": 2, "pack": True}
