@@ -142,8 +142,7 @@ class StateReader:
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
         """Return the vector from the vehicle to the goal, in the contract's world frame."""
-        if self._goal_ned_m is None:
-            raise ValueError("the contract takes a goal, and the flight has none")
+        assert self._goal_ned_m is not None  # plan_flight requires it
         north, east, down = (
             there - here for there, here in zip(self._goal_ned_m, position_ned_m, strict=True)
         )
@@ -280,9 +279,7 @@ class ObservationSource:
         parts = [state.values]
         if self._has_motion:
             parts.append(motion_since(feature.captured_ns, state, self._states))
-        if state.extras:
-            parts.append(np.array(state.extras, np.float32))
-        return np.concatenate(parts)[None]
+        return np.concatenate([*parts, np.array(state.extras, np.float32)])[None]
 
     def _missing(self, camera: int, why: Reason) -> Reason:
         """Of several cameras, name the one."""

@@ -140,7 +140,7 @@ def test_one_observation_of_one_camera_passes_through_untouched() -> None:
             of("down", because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)),
         ),
         (seen(20), seen(20, BLACK), of("down", BLACK)),
-        (seen(20), seen(20), None),
+        (seen(20), seen(300), None),
     ],
 )
 def test_no_camera_may_be_missing_old_or_at_fault(
@@ -177,6 +177,42 @@ def test_histories_are_bounded() -> None:
     assert cache.nearest(seen(0), before_ns=60_000 * MS).value[0, 0] == MAX_PAST
     short = source(THREE_STEPS, cache, past=(*past, 50))  # 50 is late
     assert len(short._states) == 201
+
+
+def aged(attitude_ms: float, velocity_ms: float) -> VehicleState:
+    return replace(felt(attitude_ms), velocity_ns=NOW_NS - round(velocity_ms * MS))
+
+
+def test_a_state_counts_by_attitude_or_velocity_and_leaves_when_both_are_old() -> None:
+    looks = source(THREE_STEPS)  # 200 ms
+    for state, kept in (
+        (aged(400, 400), 1),
+        (aged(400, 400), 1),
+        (aged(400, 390), 2),
+        (aged(390, 390), 3),
+        (aged(400, 390), 3),
+    ):
+        looks.push(state)
+        assert len(looks._states) == kept
+    for states, kept in (
+        ([aged(300, 300), aged(250, 100), aged(0, 0)], 3),
+        ([aged(300, 300), aged(100, 250), aged(0, 0)], 3),
+        ([aged(400, 400), aged(300, 300), aged(0, 0)], 2),
+    ):
+        looks = source(THREE_STEPS)
+        for state in states:
+            looks.push(state)
+        assert len(looks._states) == kept
+
+
+def test_the_newest_row_is_the_state_itself_with_its_optional_inputs() -> None:
+    state = replace(felt(0), extras=(7.0,))
+    looks = source(THREE_STEPS, cache_of(20))
+    for ago_ms in (200, 100):
+        looks.push(replace(felt(ago_ms), extras=(7.0,)))
+    looks.push(replace(state, values=felt(5).values))
+    rows = observed(looks.observe(state, NOW_NS)).states[0, -1]
+    assert rows.tolist() == [*state.values.tolist(), 7.0]
 
 
 def test_ages_of_observations() -> None:

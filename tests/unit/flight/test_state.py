@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_plan
 from helpers.fakes import level_telemetry
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.flight.state import FrozenStateCheck, StateReader, motion_since
+from mavbridge.flight.state import FrozenStateCheck, StateReader, keeps_past, motion_since
 from policy.contract import Contract, StateExtra, StateFrame
 
 MS = NS_PER_MS
@@ -143,6 +144,10 @@ def test_a_missing_old_or_future_part_is_a_reason_and_never_a_zero(
     assert isinstance(read_with(at_limit), VehicleState)
     old = because(Code.TOO_OLD, quantity=what, age_ms=limit_ms + 1e-6, limit_ms=float(limit_ms))
     assert read_with(at_limit._replace(delay_ns=limit_ns // 2 + 1)) == old
+    assert read_with(Reading(NOW_NS - limit_ns - 1, known)) == old
+    if extra is None:  # whatever else is asked for
+        without = telemetry()._replace(**{field: None})
+        assert read(without, "height") == because(code, quantity=what)
     ahead = because(Code.READING_AHEAD, quantity=what, ahead_ms=400.0)
     assert read_with(Reading(NOW_NS, known, -400 * MS)) == ahead
 
@@ -204,6 +209,13 @@ def test_the_guard_asks_for_what_the_policy_takes(
     goal = GOAL if "goal" in extras else None
     settings = make_plan(Contract(state_extras=extras), goal=goal).guard
     assert (settings.watches_home_height, settings.watches_position) == (height, position)
+
+
+def test_states_between_solves_are_kept_where_something_asks_for_them() -> None:
+    moving = Contract(since_exposure=True)
+    assert not keeps_past(make_plan(moving, rates=Rates(action_rate=20.0)))
+    assert keeps_past(make_plan(moving, rates=Rates(action_rate=19.9)))
+    assert keeps_past(make_plan(Contract(observation_steps=2)))
 
 
 # --- motion since the exposure

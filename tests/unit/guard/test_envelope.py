@@ -206,3 +206,30 @@ def test_zero_and_infinity_switch_a_limit_off(limit: float) -> None:
     flight.attitude = flight.velocity = None
     assert flight.run(2.0, position_ned_m=None) is None
     assert flight.envelope.unwatched == []
+
+
+def test_of_two_reasons_the_first_is_told() -> None:
+    told = Flight().run(1.0, position_ned_m=(400.0, 0.0, -200.0))
+    assert told == beyond("height", 200.0, 120.0)
+
+
+def test_an_estimator_that_says_nothing_is_said_to_be_not_watched() -> None:
+    missing = "estimator is not watched: it reports no valid position"
+    silent = Flight()
+    silent.run(0.1)
+    silent.run(0.1, is_position_valid=None)
+    assert missing in silent.envelope.unwatched
+    never = Flight()
+    never.run(0.1, is_position_valid=False)
+    assert missing in never.envelope.unwatched
+
+
+def test_without_a_position_from_the_start_none_is_lost() -> None:
+    flight = Flight()
+    assert flight.run(5.0, is_position_valid=False, position_ned_m=None) is None
+
+
+def test_in_the_air_counts_while_armed() -> None:
+    flight = Flight()
+    assert flight.run(1.0, armed=False, is_landed=False) is None
+    assert flight.run(2.0, armed=True, is_landed=True) is None
