@@ -184,6 +184,10 @@ def aged(attitude_ms: float, velocity_ms: float) -> VehicleState:
 
 
 def test_a_state_counts_by_attitude_or_velocity_and_leaves_when_both_are_old() -> None:
+    newest = source(Contract(feature_dim=1))
+    for ago_ms in (10, 0):
+        newest.push(felt(ago_ms))
+    assert len(newest._states) == 1
     looks = source(THREE_STEPS)  # 200 ms
     for state, kept in (
         (aged(400, 400), 1),

@@ -216,6 +216,7 @@ def test_states_between_solves_are_kept_where_something_asks_for_them() -> None:
     assert not keeps_past(make_plan(moving, rates=Rates(action_rate=20.0)))
     assert keeps_past(make_plan(moving, rates=Rates(action_rate=19.9)))
     assert keeps_past(make_plan(Contract(observation_steps=2)))
+    assert not keeps_past(make_plan(rates=Rates(action_rate=19.9)))
 
 
 # --- motion since the exposure
