@@ -169,7 +169,8 @@ class Codec:
 
         pymavlink's packer takes three times as long.
         """
-        payload = kind.unpacker.pack(*values).rstrip(b"\0") or b"\0"
+        zeros = kind.unpacker.unpack(bytes(kind.unpacker.size))  # extensions that come to be
+        payload = kind.unpacker.pack(*values, *zeros[len(values) :]).rstrip(b"\0") or b"\0"
         header = HEADER.pack(
             MARKER_V2, len(payload), 0, 0, self._sequence, *self.source, kind.id, 0
         )

@@ -15,7 +15,7 @@ from mavbridge.core.vehicle import (
     Output,
     Release,
 )
-from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
+from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.attitude import AttitudeOutput
 from mavbridge.mavlink.outputs.output import ActionOutput
 from mavbridge.mavlink.outputs.setpoints import VelocityOutput
@@ -138,7 +138,8 @@ class ActionSender:
     ) -> Iterator[tuple[int, bytes]]:
         """Yield delays [ns] and packets of resting decisions and mode requests, for later.
 
-        Encoded by a copy of the output. A packet that the codec refuses is skipped.
+        Encoded by a copy of the output. A packet that cannot be encoded is skipped: whatever fails
+        there fails in the flight, too, and must not end the guard here.
         """
         vehicle, output, now_ns = self._vehicle, copy(self.output), self._clock.now_ns()
         if vehicle is None:
@@ -146,7 +147,7 @@ class ActionSender:
         with self._codec.rehearsing():
             for after_ns, decision, mode in plan:
                 packet = None
-                with suppress(CommandRefusedError):
+                with suppress(Exception):
                     if isinstance(decision, Release) and output is not None:
                         packet = output.release_packet(vehicle, now_ns)
                     elif isinstance(decision, Command) and output is not None:

@@ -257,5 +257,5 @@ class StreamRequester:
             f"the link carries only {share:.0%} of the telemetry that was asked for: states come "
             f"at {share * wanted_hz:.3g} Hz instead of {wanted_hz:.3g} Hz; use a faster link (a "
             "higher baud rate; on PX4 also MAV_n_RATE, or a MAV_n_MODE with fewer streams of its "
-            "own), or a lower rates.action"
+            "own), a better radio if packets are lost, or a lower rates.action"
         )

@@ -94,6 +94,8 @@ class TextJoiner:
         if not self._pieces:
             self._text_id, self._since_ns = body.text_id, now_ns
         missing = body.sequence - len(self._pieces)
+        if missing < 0:  # a piece that came twice
+            return texts
         self._pieces += [*[_GAP] * missing, body.text]
         return texts if body.is_full else texts + self._end(is_whole=True)
 

@@ -42,11 +42,15 @@ STALE_NS = 100 * NS_PER_MS
 _TCP_STALE_MS = 500
 """Longest time for which sent bytes may stay unacknowledged on TCP. Then the connection closes, and
 discards the sticks queued in the kernel. Equal to the detection time of unheard sticks."""
-_DATAGRAM_BYTES = 65536
+_CHUNK_BYTES = 65536
 _STREAM_BYTES = 2048
-"""Bytes read from a stream at once: some fifty packets, after which a reader may stop."""
+"""Bytes read from a TCP stream at once: some fifty packets, after which a reader may stop."""
 _ERRORS_A_DRAIN = 16
 """Errors of earlier sends that one drain skips."""
+_SERIAL_BITS = 10
+"""Bits per byte on the wire: 8 data bits, a start and a stop bit."""
+_STAMP_STEP_NS = 2 * NS_PER_MS
+"""A serial backlog that took longer than this to arrive gets several stamps."""
 _SO_TIMESTAMPNS = 35
 """From asm-generic/socket.h; Python's socket module lacks it."""
 _TIMESPEC = struct.Struct("@qq")
@@ -168,7 +172,7 @@ class UdpTransport(_FileTransport[socket.socket]):
         errors = 0
         while self._handle is not None and errors < _ERRORS_A_DRAIN:
             try:
-                data, control, _, sender = self._handle.recvmsg(_DATAGRAM_BYTES, 64)
+                data, control, _, sender = self._handle.recvmsg(_CHUNK_BYTES, 64)
             except BlockingIOError:
                 return
             except OSError:
@@ -281,6 +285,10 @@ class SerialTransport(_FileTransport[serial.Serial]):
     def __init__(self, device: str, baud: int, clock: Clock) -> None:
         super().__init__(clock)
         self._device, self._baud = device, baud
+        self._backlog: deque[Received] = deque()
+        """Bytes read but not yet drained."""
+        self._emptied_ns = 0
+        """Last time at which the port was seen empty: later bytes arrived later."""
         self._written: deque[tuple[int, int]] = deque()
         """Size and time of the writes that may still wait in the port's queue."""
 
@@ -296,7 +304,9 @@ class SerialTransport(_FileTransport[serial.Serial]):
                 f"{_serial_obstacle(self._device, error)}"
             ) from error
         self._was_open = True
+        self._backlog.clear()
         self._written.clear()
+        self._emptied_ns = self._clock.now_ns()
 
     def _end(self, handle: serial.Serial) -> None:
         fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # the lock of ``exclusive``
@@ -305,19 +315,38 @@ class SerialTransport(_FileTransport[serial.Serial]):
         return TransportDownError(f"serial {self._device}: {error}")
 
     def drain(self) -> Iterator[Received]:
-        """Yield the bytes received so far. Bypasses pyserial, which reads 4,095 bytes at most."""
-        while self._handle is not None:
+        """Yield the bytes received so far, in pieces stamped with their time on the wire."""
+        if not self._backlog:
+            self._read()
+        while self._backlog:
+            yield self._backlog.popleft()
+
+    def _read(self) -> None:
+        """Read everything. The last byte arrived now, each earlier one a byte time before the next.
+
+        Bypasses pyserial, which reads no more than the kernel's line buffer of 4,095 bytes.
+        """
+        data = b""
+        while self._handle is not None and len(data) < _CHUNK_BYTES:
             try:
                 if not select.select([self._handle], [], [], 0)[0]:
-                    return
-                data = os.read(self._handle.fileno(), _STREAM_BYTES)
+                    break
+                piece = os.read(self._handle.fileno(), _CHUNK_BYTES)
             except BlockingIOError:
-                return
+                break
             except OSError as error:
                 raise self._down(error) from error
-            if not data:
+            if not piece:
                 raise self._down("the device is gone")
-            yield Received(data, self._clock.now_ns(), None)
+            data += piece
+        now_ns, byte_ns = self._clock.now_ns(), _SERIAL_BITS * NS_PER_S // self._baud
+        step = max(1, _STAMP_STEP_NS // byte_ns)
+        for at in range(0, len(data), step):
+            piece = data[at : at + step]
+            after_ns = (len(data) - at - len(piece)) * byte_ns
+            self._backlog.append(Received(piece, max(now_ns - after_ns, self._emptied_ns), None))
+        if len(data) < _CHUNK_BYTES:
+            self._emptied_ns = now_ns
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`. Bypasses pyserial, whose write loops forever on a full buffer."""

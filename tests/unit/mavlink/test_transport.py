@@ -165,6 +165,31 @@ def test_a_stream_reads_and_writes_and_a_reader_may_leave_the_rest_for_later(
     assert get(100) == b"answer"
 
 
+def test_a_serial_backlog_is_drained_to_its_end_with_the_times_it_took_to_come(
+    open_serial: OpenSerial,
+) -> None:
+    clock = FakeClock()
+    fd, ours = open_serial(57600, clock)
+    sent = bytes(k % 251 for k in range(9000))
+    assert os.write(fd, sent) == len(sent)
+    clock.advance_ns(10_000_000_000)
+    chunks = list(ours.drain())
+    assert b"".join(chunk.data for chunk in chunks) == sent
+    assert list(ours.drain()) == []
+    byte_ns, seen = 10 * 1_000_000_000 // 57600, 0
+    for chunk in chunks:
+        seen += len(chunk.data)
+        assert chunk.arrived_ns == clock.now_ns() - (len(sent) - seen) * byte_ns
+        assert len(chunk.data) * byte_ns <= 2_000_000
+    # What came since the port was last seen empty cannot have come before that.
+    empty_ns = clock.now_ns()
+    clock.advance_ns(10_000_000)
+    assert os.write(fd, sent[:2000]) == 2000
+    stamps = [chunk.arrived_ns for chunk in ours.drain()]
+    assert (stamps[0], stamps[-1]) == (empty_ns, clock.now_ns())
+    assert stamps == sorted(stamps)
+
+
 def test_a_serial_device_that_is_unplugged_is_noticed() -> None:
     ours_fd, theirs_fd = pty.openpty()
     ours = SerialTransport(os.ttyname(theirs_fd), 57600, MonotonicClock())
