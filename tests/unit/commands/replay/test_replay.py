@@ -124,7 +124,7 @@ def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
     replay(folder, ReplayConfig(source="chunks", json=written))
 
     told = json.loads(written.read_text())["gaps"]
-    assert re.search(r"link.tlog is damaged.*: 5\d\d bytes were skipped, with \d+ packets", told[0])
+    assert re.search(r"link.tlog is damaged.*: 5\d\d bytes were skipped", told[0])
     assert re.search(r"\d+ packets are not in the recording", told[1])
     (folder / "link.tlog").unlink()
     with pytest.raises(UserError, match=r"link\.tlog"):
