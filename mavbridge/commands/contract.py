@@ -21,7 +21,12 @@ from policy.data.lerobot import is_lerobot
 
 
 def contract(source: Path, config: ContractConfig) -> int:
-    """Write a contract file for a LeRobot policy or dataset, or for ONNX."""
+    """Write a contract file for a LeRobot policy or dataset, or for ONNX.
+
+    ``source`` may have the prefix that it has in ``--policy``.
+    """
+    named = str(source).removeprefix("lerobot:").removeprefix("onnx:")
+    source = Path(named).expanduser()
     out = config.out or (source if source.is_dir() else source.parent) / CONTRACT_FILE
     if out.exists():
         raise UserError(f"{out} is there already: change that, or name another file by --out")

@@ -63,7 +63,9 @@ def draft(source: Path, *options: str) -> Path:
 def test_a_policy_alone_leaves_the_answers_to_the_user(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = draft(checkpoint(tmp_path))
+    checkpoint(tmp_path)
+    assert status_of("contract", f"lerobot:{tmp_path}") == 0  # as for --policy
+    path = tmp_path / "mavbridge.toml"
     with pytest.raises(ContractError) as refused:
         read_interface(path)
     missing = "chunk_dt_s, [contract] state_frame, [contract] action, [state] names, [action] names"
