@@ -135,6 +135,14 @@ def test_a_step_reaches_63_percent_after_tau() -> None:
     assert after[-1] == pytest.approx(1 - math.exp(-1), abs=0.001)
 
 
+def test_a_ramp_is_followed_at_a_distance_of_tau() -> None:
+    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=1.0, tau_s=0.1), NEUTRAL)
+    for tick in range(51):
+        trace = smoother.step(Sticks(1.0, 0.0, 0.0, 0.0), tick * NS_PER_S // 100)
+    assert trace.slewed.throttle == pytest.approx(0.5)
+    assert trace.smoothed.throttle == pytest.approx(0.4 + 0.1 * math.exp(-5))
+
+
 def test_a_reset_starts_from_the_given_sticks_and_a_stall_does_not_jump() -> None:
     smoother = ActionSmoother(
         stick_smoothing(max_slew_per_s=8.0, tau_s=0.0, max_dt_s=0.03), NEUTRAL
@@ -156,7 +164,8 @@ def test_a_reset_forgets_the_flight_before_and_the_time_since() -> None:
 
 
 def test_the_longest_step_is_15_periods_of_100_hz_unless_said_otherwise() -> None:
-    smoother = ActionSmoother(stick_smoothing(max_slew_per_s=1.0), NEUTRAL)
+    limits = stick_smoothing(max_slew_per_s=1.0).limits
+    smoother = ActionSmoother(Smoothing(limits=limits, tau_s=0.0), NEUTRAL)
     smoother.step(NEUTRAL, 0)
     after_stall = smoother.step(Sticks(1.0, 0.0, 0.0, 0.0), NS_PER_S).smoothed
     assert after_stall.throttle == pytest.approx(0.15)

@@ -111,7 +111,14 @@ def test_chunks_that_come_after_their_own_end_do_not_prolong_the_grace() -> None
 
 @pytest.mark.parametrize(
     ("steps", "step_us", "period_ms", "is_possible"),
-    [(1, 20_000, 20, True), (1, 20_000, 33, False), (1, 33_300, 33, True), (16, 50_000, 10, True)],
+    [
+        (1, 20_000, 20, True),
+        (1, 20_000, 33, False),
+        (1, 32_600, 33, False),
+        (1, 33_300, 33, True),
+        (1, 99_000, 100, True),
+        (16, 50_000, 10, True),
+    ],
 )
 def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
     steps: int, step_us: int, period_ms: int, is_possible: bool
@@ -125,7 +132,7 @@ def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
     if not is_possible:
         assert codes(held.impossibility) == (Code.HORIZON_TOO_SHORT,)
         told = figures(held.impossibility, "horizon_ms", "steps", "step_ms", "gap_ms")
-        assert told == (20, 1, 20, 33)
+        assert told == (step_us / 1000, 1, step_us / 1000, 33)
 
 
 def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
@@ -190,6 +197,17 @@ def test_each_age_is_judged_when_the_chunk_arrives(age: str, name: str, limit_ms
     assert late.problem(2000 * MS) == too_old(name, limit_ms + 1e-6, limit_ms)
 
 
+def test_a_chunk_that_comes_after_its_own_end_is_told_as_that_unless_it_is_too_old() -> None:
+    short: dict[str, object] = {"actions": (NEUTRAL,) * 5, "step_ns": MS}  # acts until 1000 ms
+    assert buffer().offer(chunk(1, 1000, **short), 1000 * MS)
+    over, now_ns = buffer(), 1000 * MS + 1
+    assert not over.offer(chunk(1, 1000, **short), now_ns)
+    assert over.problem(now_ns) == because(Code.AFTER_HORIZON, horizon_ms=5, steps=5, step_ms=1)
+    assert not over.offer(chunk(2, 1000, attitude_ns=900 * MS, **short), now_ns)
+    assert over.problem(now_ns) == too_old("attitude", 100 + 1e-6, 100)
+    assert over.fault(1001 * MS) == late("attitude", 101 * MS, 100 * MS, "solve", 100 * MS)
+
+
 def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve() -> None:
     slow = buffer()
     for serial in range(1, 5):
@@ -200,9 +218,10 @@ def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve(
     assert slow.impossibility == expected
     slow.offer(chunk(10, 9100), 9100 * MS)
     assert slow.impossibility is None
-    for serial in range(11, 15):  # they count anew
-        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 101) * MS), 0)
-    assert slow.impossibility is None
+    for serial in range(11, 16):  # they count anew, and the last one just keeps the limit
+        age_ms = 101 if serial < 15 else 100
+        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - age_ms) * MS), 0)
+        assert slow.impossibility is None
 
 
 STALL, PLAYED = replace(LIMITS, stall_ns=300 * MS), LIMITS.while_played(NS_PER_S)
@@ -280,6 +299,14 @@ def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_
     assert held.fault((until_ms + 100) * MS) is None, "the next one that may be flown ends it"
 
 
+def test_a_chunk_that_comes_just_as_the_last_one_ends_makes_up_for_a_gap_before_that() -> None:
+    short: dict[str, object] = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}
+    held = holding(**short)  # until 1035 ms
+    held.offer(chunk(2, 1085, **short), 1085 * MS)
+    held.offer(chunk(3, 1120, **short), 1120 * MS)
+    assert held.fault(1220 * MS) is None
+
+
 def test_a_second_stall_is_flown_through_only_after_eight_chunks_in_time() -> None:
     held, now_ms = buffer(10, STALL), 1000
     held.offer(chunk(1, now_ms), now_ms * MS)
@@ -289,8 +316,10 @@ def test_a_second_stall_is_flown_through_only_after_eight_chunks_in_time() -> No
         assert held.fault((now_ms + 100) * MS) is None
         assert held.fault((now_ms + 101) * MS) is not None
         now_ms += 10
-    held.offer(chunk(99, now_ms), now_ms * MS)
-    assert held.fault((now_ms + 300) * MS) is None
+    for serial in (99, 100):  # the last one after just the grace
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+        assert held.fault((now_ms + 300) * MS) is None
+        now_ms += 100
 
 
 def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> None:
@@ -339,6 +368,17 @@ def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_
     assert held.problem(now_ns + 100 * MS + 1) == because(Code.NO_CHUNK)
 
 
+def test_chunks_that_mostly_end_before_the_next_one_begin_no_flight() -> None:
+    short: dict[str, object] = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}  # 35 ms are left
+    for gaps_ms in ((10, 60), (10, 35, 35)):
+        held, now_ns = began(10, *gaps_ms, **short)
+        assert held.problem(now_ns) is None
+    held, now_ns = began(10, 10, 60, 60, **short)
+    assert held.problem(now_ns) == because(
+        Code.HORIZON_TOO_SHORT, covered_ms=35, gap_ms=60, horizon_ms=40, steps=2, step_ms=20
+    )
+
+
 @EACH_AGE
 def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms: int) -> None:
     held, now_ns = began(10, 10, 10, **{age: (1020 - limit_ms + 50) * MS})
@@ -349,6 +389,7 @@ def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms:
 def test_where_there_never_was_a_chunk_there_is_a_fault_and_no_action() -> None:
     assert buffer().fault(0) == late("chunk", 0, 100 * MS, "flight process", 0)
     assert buffer().action_at(0) is None
+    assert not buffer().is_coasting(NS_PER_S)
 
 
 @pytest.mark.parametrize(
@@ -413,20 +454,21 @@ def test_no_action_is_flown_beyond_the_horizon_nor_100_ms_beyond_a_limit_but_for
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "code"),
     [
-        {"actions": (NAN,)},
-        {"actions": (NEUTRAL, NAN, NEUTRAL)},
-        {"actions": (NEUTRAL, BodyRates(0.5, 0.0, 0.0, 0.0))},
-        {"actions": ()},
-        {"step_ns": 0},
+        ({"actions": (NAN,)}, Code.NOT_FINITE),
+        ({"actions": (NEUTRAL, NAN, NEUTRAL)}, Code.NOT_FINITE),
+        ({"actions": (NEUTRAL, BodyRates(0.5, 0.0, 0.0, 0.0))}, Code.WRONG_KIND),
+        ({"actions": ()}, Code.EMPTY_CHUNK),
+        ({"step_ns": 0}, Code.EMPTY_CHUNK),
     ],
     ids=["nan", "one-nan", "another-kind", "none", "step"],
 )
-def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
+def test_a_malformed_chunk_is_not_flown(changes: dict[str, object], code: Code) -> None:
     held = holding()
     assert held.offer(chunk(2, 1010, **changes), 1010 * MS) is False
     assert held.newest == chunk(1, 1000)
+    assert held.problem(2 * NS_PER_S) == because(code)
 
 
 def test_the_shortest_step_is_one_of_a_nanosecond() -> None:
@@ -442,7 +484,7 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
         held.offer(chunk(serial, now_ms, **bad), now_ms * MS)
         faults.append(held.fault(now_ms * MS))
     assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
-    assert codes(faults[-1]) == (Code.UNUSABLE_CHUNKS, Code.NOT_FINITE)
+    assert faults[-1] == because(Code.UNUSABLE_CHUNKS, chunks=5, why=because(Code.NOT_FINITE))
     assert held.problem(now_ms * MS) == faults[-1], "nor may the next flight begin at once"
     held.offer(chunk(99, now_ms + 1000), (now_ms + 1000) * MS)
     assert Code.UNUSABLE_CHUNKS not in codes(held.problem((now_ms + 1000) * MS))
@@ -460,6 +502,7 @@ def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
     held.explain_absence(because(Code.NO_IMAGE), 0)
     assert held.problem(0) == because(Code.NO_IMAGE)
     held.offer(chunk(1, 1000), 1000 * MS)
+    assert held.problem(1101 * MS) == because(Code.NO_CHUNK), "it has given one since"
     held.explain_absence(because(Code.IMAGE_FROZEN, age_s=0.6), 1010 * MS)
     assert codes(held.fault(1200 * MS)) == (Code.LATE, Code.IMAGE_FROZEN)
 
@@ -471,8 +514,8 @@ def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
     ("now_ms", "stood_ms", "place"),
     [
         (1104, 0, "flight process"),
-        (1131, 10, "flight process"),
-        (1131, 131, "computer"),  # the guard did not look either
+        (1131, 65, "flight process"),
+        (1130, 65, "computer"),  # the guard did not look either, for half of it
     ],
 )
 def test_who_was_silent_is_named_with_the_input_that_ran_out_first(
@@ -481,9 +524,17 @@ def test_who_was_silent_is_named_with_the_input_that_ran_out_first(
     held, spent_ms = holding(), now_ms - 1000
     assert held.lateness(1100 * MS) is None
     told = held.lateness(now_ms * MS, stood_ns=stood_ms * MS)
-    assert told == late("attitude", (spent_ms + 5) * MS, 100 * MS, place, spent_ms * MS)
     names = ("quantity", "age_ms", "limit_ms", "place", "spent_ms")
-    assert figures(told, *names) == ("attitude", spent_ms + 5, 100, place, spent_ms)
+    lost_ms = stood_ms if place == "computer" else spent_ms
+    assert figures(told, *names) == ("attitude", spent_ms + 5, 100, place, lost_ms)
+
+
+@pytest.mark.parametrize(("ago_ms", "place"), [(100, "computer"), (99, "guard")])
+def test_a_chunk_of_the_second_half_of_a_stall_shows_that_the_guard_alone_stood_still(
+    ago_ms: int, place: str
+) -> None:
+    told = holding().lateness(1200 * MS, stood_ns=200 * MS, arriving=chunk(2, 1200 - ago_ms))
+    assert figures(told, "place", "spent_ms") == (place, 200)
 
 
 @pytest.mark.parametrize("name", ["attitude", "velocity"])
@@ -516,6 +567,7 @@ def test_what_the_flight_process_says_comes_first() -> None:
     held.explain_absence(because(Code.POLICY_REFUSED, said="its server is gone"), 1050 * MS)
     told = held.fault(1104 * MS)
     assert codes(told) == (Code.LATE, Code.POLICY_REFUSED)
+    assert figures(told, "place", "spent_ms") == ("flight process", 54)
     assert str(told) == "its server is gone; attitude 109 ms old (limit 100 ms)"
 
 
@@ -523,4 +575,13 @@ def test_a_grace_that_ends_within_all_limits_names_the_chunk_or_its_horizon() ->
     held = holding(10, LIMITS.while_played(NS_PER_S))
     assert figures(held.fault(1101 * MS), "quantity", "age_ms", "limit_ms") == ("chunk", 101, 100)
     held = holding(100, LIMITS.while_played(NS_PER_S), actions=(NEUTRAL,) * 2)
-    assert held.fault(1196 * MS) == late("horizon", 196 * MS, 95 * MS, "flight process", 196 * MS)
+    assert held.fault(1196 * MS) == because(
+        Code.PAST_HORIZON,
+        quantity="chunk",
+        age_ms=196,
+        limit_ms=95,
+        place="flight process",
+        spent_ms=196,
+    )
+    held = holding(attitude_ns=1001 * MS)
+    assert held.fault(1101 * MS) == late("chunk", 101 * MS, 100 * MS, "flight process", 101 * MS)

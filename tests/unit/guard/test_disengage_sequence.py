@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, Stepped, altered, codes, flying
-from mavbridge.core.clock import NS_PER_MS
+from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, Stepped, altered, flying
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.core.vehicle import ModeRoles
@@ -73,33 +73,48 @@ def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest
     assert stepped.step(are_sticks_at_rest=True) == Actions(control=NEUTRAL, mode=mode)
 
 
-def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Actions]:
-    """AUTO.LOITER becomes POSCTL 20 ms after it was entered; what follows in 0.2 s."""
+def held_by_px4(seconds: float = 0.01) -> Stepped:
+    """In AUTO.LOITER for so long since a fault."""
     stepped = at_fault(PX4)
     while stepped.step().mode is None:
         pass
-    stepped.step(mode="AUTO.LOITER")
-    changes["stick_override_ns"] = stepped.facts.now_ns if is_told else None
-    return [stepped.step(mode="POSCTL", **changes) for _ in range(20)]
+    stepped.run(seconds, mode="AUTO.LOITER")
+    return stepped
 
 
-def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again() -> None:
-    moves = leave_for_a_hand(is_told=True)
+def left_for_a_hand(stepped: Stepped, told_ns: int | None, **changes: Any) -> list[Actions]:
+    """AUTO.LOITER becomes POSCTL, and perhaps an EVENT tells of sticks; 0.2 s from there on."""
+    changes |= {"mode": "POSCTL", "stick_override_ns": told_ns}
+    return [stepped.step(**changes) for _ in range(20)]
+
+
+@pytest.mark.parametrize("seconds", [0.01, 1.0])
+def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again(seconds: float) -> None:
+    stepped = held_by_px4(seconds)
+    moves = left_for_a_hand(stepped, stepped.facts.now_ns)
     assert "AUTO.LOITER" in {move.mode for move in moves}
     assert {move.control for move in moves} == {NEUTRAL}
+    stepped.step(mode="AUTO.LOITER")
+    moves = left_for_a_hand(stepped, stepped.facts.status.stick_override_ns)
+    assert moves[11].control is RELEASE, "the next hand needs its own EVENT"
 
 
 @pytest.mark.parametrize(
-    "changes", [{"is_told": False}, {"is_told": True, "problem": OVERRULED, "is_overruled": True}]
+    ("told_ns", "seconds", "changes", "waits"),
+    [
+        (None, 0.01, {}, 11),  # its word is waited for 100 ms
+        (0, 0.01, {}, 11),
+        (NS_PER_S, 1.01, {}, 0),
+        (NS_PER_S, 0.01, {"echo_confirmed": False}, 0),
+        (NS_PER_S, 0.01, {"problem": OVERRULED, "is_overruled": True}, 0),
+    ],
 )
-def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> None:
-    moves = leave_for_a_hand(**changes)
+def test_another_stations_mode_and_a_hand_of_the_pilots_win(
+    told_ns: int | None, seconds: float, changes: Any, waits: int
+) -> None:
+    moves = left_for_a_hand(held_by_px4(seconds), told_ns, **changes)
     assert {move.mode for move in moves} == {None}
-    controls = [move.control for move in moves]
-    if "problem" in changes:
-        assert controls[-1] is not NEUTRAL
-    else:
-        assert controls.index(RELEASE) == 11, "its word is waited for 100 ms"
+    assert [move.control for move in moves].index(RELEASE) == waits
 
 
 @pytest.mark.parametrize(
@@ -135,6 +150,7 @@ def test_a_vehicle_that_its_policy_stopped_is_held_before_a_hand_gets_it(
     assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
     if mode == "BRAKE":
         assert RELEASE in {move.control for move in stepped.run(1.0, mode="BRAKE")}
+        assert flying(facts, keeps_place=True).step(**FAULT).mode is None, "it did not stop it"
 
 
 def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
@@ -150,13 +166,17 @@ def test_a_refused_mode_becomes_land() -> None:
     moves = stepped.run(0.2, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in moves}
     assert stepped.step(mode="LAND", refused_mode=None).control is RELEASE
+    late = at_fault(NO_RECEIVER).run(0.3, mode="BRAKE", refused_mode="BRAKE")
+    assert {move.mode for move in late} == {None}, "it has come all the same"
 
 
 @pytest.mark.parametrize("hold", ["", "BRAKE"])
 def test_where_the_vehicle_has_no_such_mode_neutral_holds_it(hold: str) -> None:
     facts = altered(IDLE_RECEIVER, modes=replace(COPTER_MODES, hold=hold, land=""))
     stepped = at_fault(facts)
-    assert {move.control for move in stepped.run(5, refused_mode="BRAKE")} == {NEUTRAL}
+    stepped.run(5, refused_mode="BRAKE")
+    assert {move.control for move in stepped.moves[2:]} == {NEUTRAL}
+    assert {move.mode for move in stepped.moves} == {None, hold or None}
     assert stepped.phase is Phase.HOLDING
 
 
@@ -171,9 +191,11 @@ def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
     stepped.engagement.stop(EndRequest(reason=because(Code.DURATION), is_fault=is_fault))
     mode = stepped.step().mode
     assert mode == ("BRAKE" if is_fault else "LAND")
-    throttle_code = Code.THROTTLE_UNKNOWN if throttle is None else Code.THROTTLE_RESTS
-    refusal = (Code.NOT_RELEASED, throttle_code) if settings else ()
-    assert codes(stepped.engagement.refusal) == refusal
+    why = because(Code.THROTTLE_UNKNOWN)
+    if throttle is not None:
+        why = because(Code.THROTTLE_RESTS, percent=100 * throttle, limit_percent=20)
+    refusal = because(Code.NOT_RELEASED, instead="hold" if is_fault else "land", why=why)
+    assert stepped.engagement.refusal == (refusal if settings else None)
     assert {move.control for move in stepped.run(40)} == {NEUTRAL}, "never confirmed"
     assert stepped.step(mode=mode).control is RELEASE
 
@@ -186,6 +208,9 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     assert stepped.phase is Phase.HOLDING
     assert stepped.engagement.refusal == because(Code.MODE_NOT_CONFIRMED, mode="BRAKE")
     assert sum(move.mode == "BRAKE" for move in stepped.run(5)) == 5, "asked for again"
+    stepped.run(1.0, problem=because(Code.HEARTBEAT_LOST))
+    assert sum(move.mode == "BRAKE" for move in stepped.run(1)) == 10, "nobody sees a refusal"
+    stepped.step(problem=None)
     assert stepped.step(mode="BRAKE").control is RELEASE
     stepped.run(1)
     assert stepped.phase is Phase.RELEASED
@@ -223,11 +248,19 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
 def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral_and_no_hand_holds_it(
     facts: Any, mode: str
 ) -> None:
-    stepped = flying(altered(facts, mode=mode), modes=(mode,))
-    moves = [stepped.step(**FAULT), *stepped.run(5)]
+    stepped = flying(altered(facts, mode=mode), modes=(mode,), on_fault="release")
+    moves = [stepped.step(**FAULT)]
+    why = because(Code.THROTTLE_IS_THRUST, mode=mode)
+    assert stepped.engagement.refusal == because(Code.NOT_RELEASED, instead="hold", why=why)
+    moves += stepped.run(5)
     assert {move.control for move in moves} == {LEVEL}
     assert moves[0].mode == "BRAKE"
     assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
+
+
+def test_where_px4_may_take_a_jump_to_neutral_for_a_hand_the_throttle_stays() -> None:
+    stepped = at_fault(altered(PX4, mode="STABILIZED"), modes=("STABILIZED",))
+    assert {move.control for move in stepped.run(1.0, mode="AUTO.LOITER")} == {LEVEL}
 
 
 def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
@@ -256,7 +289,13 @@ def standstill(stepped: Any, seconds: float, **changes: Any) -> Actions:
 
 
 @pytest.mark.parametrize(
-    ("facts", "blind_s"), [(IDLE_RECEIVER, 3.0), (NO_RECEIVER, 0.5), (PX4, 0.5)]
+    ("facts", "blind_s"),
+    [
+        (IDLE_RECEIVER, 3.0),
+        (NO_RECEIVER, 0.5),
+        (PX4, 0.5),
+        (altered(IDLE_RECEIVER, modes=replace(COPTER_MODES, needs_setpoints_first=True)), 0.5),
+    ],
 )
 def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
     facts: Any, blind_s: float
@@ -363,6 +402,11 @@ def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_
 
 
 GUIDED = altered(AIRBORNE, mode="GUIDED")
+
+
+def test_setpoints_end_in_a_mode_that_holds_also_where_sticks_would_do() -> None:
+    stepped = flying(altered(AIRBORNE, mode="LOITER"), is_setpoint=True, modes=("LOITER",))
+    assert stepped.step(**FAULT).mode == "BRAKE"
 
 
 @pytest.mark.parametrize(("is_landed", "hand"), [(True, IDLE), (False, NEUTRAL)])

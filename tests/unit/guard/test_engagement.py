@@ -245,7 +245,7 @@ def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
         is_echoed=False,
         inputs=because(Code.NO_IMAGE),
     )
-    assert stepped.engagement.outcome == Outcome(), "the policy never flew"
+    assert stepped.engagement.outcome == (0, None, 0, False, None, None), "the policy never flew"
 
 
 def test_what_was_not_confirmed_is_told_once() -> None:

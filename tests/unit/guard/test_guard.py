@@ -35,16 +35,12 @@ from mavbridge.core.vehicle import (
     Telemetry,
     Velocity,
 )
-from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.chunks import Chunk, FreshnessLimits, late
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 MS = NS_PER_MS
-SWITCHED_OFF = because(Code.OVERRIDE_SWITCH_OFF)
-HEARTBEAT_LOST = because(Code.HEARTBEAT_LOST)
-REBOOTED = because(Code.REBOOTED)
-OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="another station")
 WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
 SLOW = stick_smoothing(max_slew_per_s=1.0, tau_s=0.0)
 PILOT = Sticks(0.1, 0.0, -0.3, 0.05)
@@ -105,6 +101,7 @@ class Stepped:
         *,
         act: OperatorCommand | None = None,
         stop: EndRequest | None = None,
+        fault: Reason | None = None,
         **changes: Any,
     ) -> GuardOutput:
         now_ns = START_NS + round(at_ms * MS)
@@ -120,7 +117,8 @@ class Stepped:
             ),
             **self.link,
         )
-        output = self.guard.step(now_ns, GuardInput(link=link, chunk=chunk, act=act, stop=stop))
+        given = GuardInput(link=link, chunk=chunk, act=act, stop=stop, command_fault=fault)
+        output = self.guard.step(now_ns, given)
         if output.decision is not None:
             self.is_released = isinstance(output.decision, Release)
         self.outputs.append(output)
@@ -153,11 +151,12 @@ def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() ->
     guard = Stepped().engaged()
     early = guard.step(33, guard.chunk(33))
     assert (early.decision, early.tick.slot) == (Command(action=WANTED), None)
+    assert early.tick.missed_slots == 0
     served = guard.step(40)  # 7 ms later
     assert served.tick.slot == 4
     assert served.decision == Command(action=WANTED)
-    late = guard.step(46, guard.chunk(46))
-    assert (late.decision, late.tick.slot) == (Command(action=WANTED), None)
+    again = guard.step(46, guard.chunk(46))
+    assert (again.decision, again.tick.slot) == (Command(action=WANTED), None)
     left_out = guard.step(50)  # 4 ms later
     assert (left_out.decision, left_out.tick.slot) == (None, None)
     after = guard.step(60)
@@ -204,7 +203,7 @@ def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> No
     assert (asked.tick.phase, asked.tick.starting_ns) == (Phase.PREPARING, START_NS + 30 * MS)
     held = guard.step(40, guard.chunk(40)._replace(reset_ns=START_NS + 30 * MS - 1))
     assert (held.tick.phase, held.decision) == (Phase.PREPARING, None)
-    flown = guard.step(50, guard.chunk(50)._replace(reset_ns=START_NS + 41 * MS))
+    flown = guard.step(50, guard.chunk(50)._replace(reset_ns=START_NS + 30 * MS))
     assert (flown.tick.phase, flown.tick.starting_ns) == (Phase.FLYING, 0)
     assert flown.tick.chunk_serial == 6
 
@@ -220,6 +219,8 @@ def test_an_act_that_was_taken_back_leaves_no_reset_for_the_next_one() -> None:
         guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=START_NS + 35 * MS))
     asked = guard.step(2000, guard.chunk(2000)._replace(reset_ns=START_NS + 35 * MS), act="engage")
     assert (asked.tick.phase, asked.tick.starting_ns) == (Phase.PREPARING, START_NS + 2000 * MS)
+    last = guard.step(5020).tick  # 3 s and two periods of the policy later
+    assert last.phase is Phase.PREPARING
 
 
 def test_a_reset_that_takes_longer_than_the_grace_is_asked_for_once() -> None:
@@ -249,15 +250,16 @@ def spent(reason: Reason | None) -> tuple[Any, Any]:
 
 
 def test_a_computer_that_stood_still_is_told_as_that() -> None:
-    guard = Stepped().engaged()
-    assert spent(guard.step(30 + 131).tick.reason) == ("computer", 131)
+    tick = Stepped().engaged().step(30 + 131).tick
+    assert spent(tick.reason) == ("computer", 131)
+    assert (tick.due_ns, tick.missed_slots) == (START_NS + 160 * MS, 12)
 
 
 def test_a_guard_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_chunk() -> None:
     guard = Stepped().engaged()
-    late = guard.step(30 + 2000, guard.chunk(30 + 2000))
-    assert late.decision == Command(action=NEUTRAL)
-    assert spent(late.tick.reason) == ("guard", 2000)
+    stood = guard.step(30 + 2000, guard.chunk(30 + 2000))
+    assert stood.decision == Command(action=NEUTRAL)
+    assert spent(stood.tick.reason) == ("guard", 2000)
     assert guard.step(2040, guard.chunk(2040)).decision in (Command(action=NEUTRAL), None)
 
 
@@ -277,7 +279,8 @@ def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_
             if guard.guard.phase is not Phase.FLYING:
                 break
             assert output.tick.is_coasting == (at_ms > 50)
-        assert (spent(output.tick.reason)[0] == "link") == (heard_until_ms < 230)
+        silent = late("attitude", 110 * MS, 100 * MS, "link", 110 * MS)
+        assert (output.tick.reason == silent) == (heard_until_ms < 230)
         return at_ms - 10
 
     assert flies_until_ms(1000) == 330, "300 ms after its last chunk"
@@ -299,10 +302,84 @@ def test_a_computer_that_stood_still_flies_on_when_chunk_and_vehicle_come_back(
         assert guard.guard.phase is Phase.FLYING
 
 
+@pytest.mark.parametrize(("stood_still_ms", "flies"), [(60, False), (61, True)])
+def test_silence_counts_from_the_end_of_a_stall_of_more_than_60_ms(
+    stood_still_ms: int, flies: bool
+) -> None:
+    guard = Stepped(freshness=STALL).engaged()
+    guard.telemetry = heard(30)
+    guard.step(30 + stood_still_ms)
+    assert (guard.step(140).tick.phase is Phase.FLYING) == flies
+
+
+@pytest.mark.parametrize(
+    ("name", "heard_ms"),
+    [
+        ("attitude", {"ned_from_body_wxyz": 40, "rate_body_radps": 10}),
+        ("attitude", {"rate_body_radps": 10}),
+        ("velocity", {"velocity_ned_mps": 10}),
+        ("velocity", {"velocity_ned_mps": 40, "specific_force_body_mps2": 10}),
+    ],
+)
+def test_the_link_is_named_where_it_has_not_brought_one_reading_for_longest(
+    name: str, heard_ms: dict[str, int]
+) -> None:
+    limit = "state_ns" if name == "attitude" else "velocity_ns"
+    guard = Stepped(freshness=replace(AGES, **{limit: 50 * MS})).engaged()
+    guard.telemetry = Telemetry(
+        **{
+            each: Reading(START_NS + at_ms * MS, (1.0, 0.0, 0.0, 0.0)[: 4 if "xyz" in each else 3])
+            for each, at_ms in heard_ms.items()
+        }
+    )
+    for at_ms in range(40, 150, 10):
+        output = guard.step(at_ms)
+    assert output.tick.reason == late(name, 113 * MS, 50 * MS, "link", 130 * MS)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("readonly", [False, True])
+def test_sticks_that_were_not_sent_are_not_gone_on_from_but_where_none_are_sent(
+    readonly: bool,
+) -> None:
+    guard = Stepped(smoothing=SLOW, readonly=readonly).engaged()
+    for at_ms in (40, 50, 60):
+        guard.step(at_ms)
+    guard.guard.unsent()
+    decision = guard.step(70).decision
+    assert isinstance(decision, Command)
+    assert decision.action.throttle == pytest.approx(0.05 if readonly else 0.02)
+    assert guard.step(200).tick.phase is (Phase.WAITING if readonly else Phase.LEAVING)
+
+
 # --- what link and vehicle say
 
 
-LEFT = Command(action=NEUTRAL)
+@pytest.mark.parametrize("fresh", ["mode_arrived_ns", "channels_arrived_ns", "attitude", None])
+def test_a_vehicle_is_heard_by_its_newest_message_and_asked_for_a_mode_as_long(
+    fresh: str | None,
+) -> None:
+    old = {"mode_arrived_ns": START_NS, "channels_arrived_ns": START_NS}
+    guard = Stepped(status={"has_receiver": False, **old})
+    guard.telemetry = heard(0)
+    guard.engaged().step(31, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+    for at_ms in range(40, 1000, 10):
+        if fresh == "attitude":
+            guard.telemetry = heard(at_ms)
+        news = {fresh: START_NS + at_ms * MS} if fresh in old else {}
+        guard.step(at_ms, **news)
+    asked = {output.actions.mode for output in guard.outputs[-30:]}
+    assert asked == ({None} if fresh is None else {None, "BRAKE"})
+
+
+@pytest.mark.parametrize("fault", [None, because(Code.COMMAND_FAILED)])
+def test_where_neutral_may_not_have_been_sent_px4_is_not_asked_for_a_mode_at_once(
+    fault: Reason | None,
+) -> None:
+    status = {"mode": "ALTCTL", "has_receiver": False}
+    guard = Stepped(roles=PX4_MODES, modes=("ALTCTL",), status=status).engaged()
+    guard.step(40, fault=fault, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+    asked = {guard.step(at_ms).actions.mode for at_ms in range(50, 150, 10)}
+    assert ("AUTO.LOITER" in asked) == (fault is None)
 
 
 def test_the_envelope_ends_a_flight_as_a_fault() -> None:
@@ -318,6 +395,13 @@ def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
     for k in range(8):
         guard.step(10 * k, guard.chunk(10 * k)._replace(attitude_ns=START_NS - 400 * MS))
     assert codes(guard.guard.failure) == (Code.TOO_SLOW,)
+
+
+def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
+    guard = Stepped(arm=True, status={"armed": False})
+    guard.step(0, guard.chunk(0))
+    guard.step(10, fault=because(Code.COMMAND_FAILED))
+    assert guard.guard.failure == because(Code.COMMAND_FAILED)
 
 
 def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -> None:
@@ -517,6 +601,7 @@ def test_absence_is_the_reason_for_not_flying() -> None:
 
 def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     guard = Stepped().guard
+    assert list(guard.rehearse()) == []
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem=because(Code.NO_HEARTBEAT))
     waiting = guard.step(START_NS, GuardInput(link=link, act="engage"))
     assert (waiting.tick.phase, waiting.decision) == (Phase.WAITING, None)
@@ -565,13 +650,16 @@ def of_velocities(mode: str, **rules: Any) -> Stepped:
     )
 
 
-def test_a_velocity_is_braked_within_the_limit_of_acceleration() -> None:
+@pytest.mark.parametrize(("is_landed", "x_mps"), [(False, 2.95), (True, 0.0)])
+def test_a_velocity_is_braked_within_the_limit_of_acceleration_but_on_the_ground(
+    is_landed: bool, x_mps: float
+) -> None:
     guard = of_velocities("OFFBOARD")
     guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.0, 0.0, 0.0)))
     guard.engaged(sticks=Velocity(3.0, 0.0, 0.0, 0.0))
-    braking = guard.step(40, act="release").decision
+    braking = guard.step(40, act="release", is_landed=is_landed).decision
     assert isinstance(braking, Command)
-    assert braking.action == pytest.approx((2.95, 0.0, 0.0, 0.0))
+    assert braking.action == pytest.approx((x_mps, 0.0, 0.0, 0.0))
 
 
 def test_neutral_velocities_on_the_way_in_begin_with_what_the_vehicle_does() -> None:
