@@ -142,6 +142,7 @@ def begun(
 def test_the_first_step_asks_at_once_and_the_second_a_second_later() -> None:
     sequence = begun(GROUND)
     assert sequence.step(GROUND, None).mode == "ALT_HOLD"
+    assert sequence.waits_for == because(Code.WAITING_FOR_MODE, mode="ALT_HOLD")
     just_before = altered(GROUND, now_ns=NS_PER_S - 1)
     assert sequence.step(just_before, None).mode is None
     assert sequence.step(altered(GROUND, now_ns=NS_PER_S), None).mode == "ALT_HOLD"
@@ -184,7 +185,17 @@ IN_OFFBOARD = {"armed": True, "mode": "OFFBOARD", "modes": PX4_MODES}
             Code.TAKEOFF_NEEDS_POSITION,
         ),
         (GROUND, CLIMB | SETPOINTS, IN_OFFBOARD, None, ["climb 10"], Code.TAKING_OFF),
+        (GROUND, CLIMB | SETPOINTS, {**IN_OFFBOARD, "problem": NO_ECHO}, None, [], Code.NO_ECHO),
+        (
+            AIRBORNE,
+            SETPOINTS | {"modes": ("GUIDED",)},
+            {},
+            None,
+            ["mode GUIDED"],
+            Code.WAITING_FOR_MODE,
+        ),
         (LOITERING, SETPOINTS, {}, NEUTRAL, [], Code.WAITING_FOR_MODE),
+        (altered(LOITERING, has_receiver=False), {"modes": ("AUTO.LOITER",)}, {}, None, [], None),
         (
             LOITERING,
             SETPOINTS | {"modes": ("POSCTL",)},
@@ -265,7 +276,27 @@ def test_a_vehicle_without_sticks_that_refuses_the_mode_is_lent_ours_for_this_wa
     assert sequence.has_sticks
     flowed = altered(refused, now_ns=1 + FLOW_NS)
     assert sequence.step(flowed, None) == Actions(control=NEUTRAL, mode="ALTCTL")
+    assert sequence.step(altered(flowed, now_ns=2 + FLOW_NS), None) == Actions(control=NEUTRAL)
     sequence.begin(facts)
+    assert not sequence.has_sticks
+
+
+@pytest.mark.parametrize(
+    ("facts", "given"),
+    [
+        (altered(LOITERING, has_receiver=False), {"modes": ("OFFBOARD",)}),
+        (altered(LOITERING, has_receiver=False), SETPOINTS | {"modes": ("ALTCTL",)}),
+        (LOITERING, {"modes": ("ALTCTL",)}),
+        (altered(IN_STABILIZE, has_receiver=False), {}),
+    ],
+)
+def test_no_sticks_are_lent_for_setpoints_nor_where_none_are_lacked(
+    facts: EngagementInputs, given: dict[str, Any]
+) -> None:
+    sequence = begun(facts, **given)
+    asked = sequence.step(facts, None).mode
+    sequence.step(altered(facts, now_ns=1, refused_mode=asked), None)
+    assert asked is not None
     assert not sequence.has_sticks
 
 
@@ -279,5 +310,6 @@ def test_nine_tenths_of_the_height_are_enough_and_count_from_where_it_stood() ->
     climbing = altered(GROUND, mode="GUIDED", armed=True, is_landed=False, height_m=5.5)
     sequence.step(climbing, None)
     assert not sequence.is_up
-    sequence.step(altered(climbing, height_m=6.0), None)
-    assert sequence.is_up
+    for height_m in (6.0, 5.0):
+        sequence.step(altered(climbing, height_m=height_m), None)
+        assert sequence.is_up

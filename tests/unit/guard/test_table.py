@@ -191,6 +191,8 @@ CASES = {
     "key, the vehicle shows ours": Case(asked, {**KEY, "is_released": False}, RELEASING, RELEASE,
         why=Code.OPERATOR),
     "key, in our OFFBOARD": Case(entering, KEY, LEAVING, NEUTRAL, "AUTO.RTL", Code.OPERATOR),
+    "key, in our OFFBOARD for long": Case(lambda: after(flowing, 1.5, mode="OFFBOARD",
+        is_policy_reset=False), KEY, LEAVING, NEUTRAL, "AUTO.RTL", Code.OPERATOR),
     "key, as our OFFBOARD comes": Case(flowing, {**KEY, "mode": "OFFBOARD"}, LEAVING, NEUTRAL,
         "AUTO.RTL", Code.OPERATOR),
     "another allowed mode on the way in": Case(lambda: after(waiting, 0.01, act="engage",
