@@ -2,8 +2,10 @@
 
 import math
 import re
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -69,6 +71,12 @@ _VELOCITY_MASK = 0x5C7
 
 class CommandRefusedError(Exception):
     """Stick command that must not be sent; always a bug upstream of the codec."""
+
+
+@cache
+def _zeros(layout: struct.Struct) -> tuple[float | bytes, ...]:
+    """Return the fields of an empty message, in the order of the wire."""
+    return layout.unpack(bytes(layout.size))
 
 
 class Codec:
@@ -169,8 +177,8 @@ class Codec:
 
         pymavlink's packer takes three times as long.
         """
-        zeros = kind.unpacker.unpack(bytes(kind.unpacker.size))  # extensions that come to be
-        payload = kind.unpacker.pack(*values, *zeros[len(values) :]).rstrip(b"\0") or b"\0"
+        later = _zeros(kind.unpacker)[len(values) :]  # extensions of a newer dialect
+        payload = kind.unpacker.pack(*values, *later).rstrip(b"\0") or b"\0"
         header = HEADER.pack(
             MARKER_V2, len(payload), 0, 0, self._sequence, *self.source, kind.id, 0
         )
