@@ -25,8 +25,7 @@ def contract(source: Path, config: ContractConfig) -> int:
 
     ``source`` may have the prefix that it has in ``--policy``.
     """
-    named = str(source).removeprefix("lerobot:").removeprefix("onnx:")
-    source = Path(named).expanduser()
+    source = Path(str(source).removeprefix("lerobot:").removeprefix("onnx:"))
     out = config.out or (source if source.is_dir() else source.parent) / CONTRACT_FILE
     if out.exists():
         raise UserError(f"{out} is there already: change that, or name another file by --out")
