@@ -150,6 +150,8 @@ class DemonstrateConfig(Ranged):
         """Raise UserError if the expert could not fly so."""
         super().__post_init__()
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
+        if self.policy.checkpoint is None and self.policy.policy != PolicyConfig.policy:
+            raise UserError(f"--policy {self.policy.policy} is the student: give its --checkpoint")
         if self.solve_time > 0 and self.policy.checkpoint is None:
             raise UserError("--solve-time is the student's: give its --checkpoint")
         check_range("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")

@@ -134,6 +134,11 @@ def test_no_demonstration_flies_a_held_out_course_and_only_a_student_is_slow(
         replace(config(tmp_path), solve_time=100.0)
 
 
+def test_a_named_student_needs_its_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--policy toge-rates is the student"):
+        replace(config(tmp_path), policy=PolicyConfig(policy="toge-rates"))
+
+
 def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
     plan = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
     assert from_now(plan, 1.5)[0, :, 0].tolist() == [6.0, 10.0, 12.0, 12.0]
