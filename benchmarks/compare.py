@@ -104,9 +104,9 @@ def fly() -> dict[str, Any]:
         out = Path(folder) / "check.json"
         command = (sys.executable, "-m", "mavbridge", "check", "--connect", "none")
         subprocess.run([*command, "--soak", str(FLIGHT_S), "--json", str(out)], check=False)
-        soak: dict[str, Any] | None = loads(out.read_text())["soak"]
+        soak: dict[str, Any] | None = loads(out.read_text())["soak"] if out.exists() else None
     if soak is None:
-        raise UserError("the flight was not measured: see the row soak")
+        raise UserError("the flight was not measured: mavbridge check says why, above")
     return soak
 
 

@@ -5,10 +5,9 @@ import platform
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import TimeoutError as PoolTimeoutError
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -24,6 +23,8 @@ _CORES = 2
 _GOVERNOR = "devices/system/cpu/cpu0/cpufreq/scaling_governor"
 _STEAL_FIELD = 8
 """Index of "steal" in the line "cpu": cpu user nice system idle iowait irq softirq steal."""
+_TRIAL_S = 20
+"""Time in which a new process must have tried the rights of the guard."""
 _row = partial(CheckRow, "computer")
 
 
@@ -33,9 +34,12 @@ def computer_rows(rates: Rates) -> Iterator[CheckRow]:
     shared = "guard and policy share one core: a slow policy delays the sticks"
     yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
     try:  # in a process of its own, so that this one is not affected
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            refused = pool.submit(settle_guard, realtime=rates.realtime).result() or ""
-    except (OSError, BrokenProcessPool) as error:
+        with get_context("spawn").Pool(1) as pool:
+            trial = pool.apply_async(settle_guard, kwds={"realtime": rates.realtime})
+            refused = trial.get(_TRIAL_S) or ""
+    except PoolTimeoutError:
+        refused = f"the rights of the guard could not be tried: no answer in {_TRIAL_S} s"
+    except OSError as error:
         refused = f"the rights of the guard could not be tried: {error}"
     yield _row(
         "rights of the guard",
