@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from policy.contract import CameraImage
@@ -171,17 +172,27 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
             stream = container.streams.video[0]
             stream.codec_context.options = {"err_detect": "explode"}
             images = zip(parts.fragments, container.decode(stream), strict=False)
-            left = len(wanted)
+            left, converter = len(wanted), VideoReformatter()
             for fragment, image in images:
                 if fragment.number in wanted:
-                    yield _pixels(image)
+                    yield _pixels(image, converter)
                     left -= 1
                     if not left:
                         return
         raise ValueError(f"{left} images are missing at its end")
 
 
-def _pixels(image: av.VideoFrame) -> CameraImage:
+def _pixels(image: av.VideoFrame, converter: VideoReformatter) -> CameraImage:
     if image.format.name.startswith("gray16"):
         return image.to_ndarray().astype(np.uint16, copy=False)
-    return image.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+    return rgb_pixels(image, converter)
+
+
+def rgb_pixels(image: av.VideoFrame, converter: VideoReformatter) -> NDArray[np.uint8]:
+    """Return a decoded image as RGB [H, W, 3].
+
+    One converter serves all images of a video: without it PyAV sets up a conversion, and starts
+    its threads, for each of them.
+    """
+    rgb = converter.reformat(image, format="rgb24", threads=1)
+    return rgb.to_ndarray().astype(np.uint8, copy=False)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from av.video.reformatter import VideoReformatter
 
 from policy.contract import (
     ACTION_NAMES,
@@ -25,6 +26,7 @@ from policy.contract import (
 )
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
+from policy.data.flight_video import rgb_pixels
 from policy.data.tables import numbers, parse_state_frame, stamps, vectors
 from policy.files import library_name, read_object, why_unreadable
 
@@ -275,7 +277,7 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
             stream = container.streams.video[0]
             tick_s = float(stream.time_base or 0)
             container.seek(max(0, round(row.from_s / tick_s) - 1), backward=True, stream=stream)
-            wanted = 0
+            wanted, converter = 0, VideoReformatter()
             for frame in container.decode(stream):
                 if frame.pts is None:
                     continue
@@ -284,7 +286,7 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
                     raise DatasetError(f"{row.name}: {row.video} has no frame for row {wanted}")
                 if number < wanted:
                     continue
-                yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+                yield rgb_pixels(frame, converter)
                 wanted += 1
                 if wanted == row.length:
                     return
