@@ -6,11 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Contract
-from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
-from policy.loading.load import load_policy
-from policy.loading.request import PolicyRequest
 from policy.nets.diffusion import DdimStep, NoiseSchedule, ddim_solve
-from policy.protocol import PolicyRunner
 
 SINGLE = Contract(image_height=32, image_width=32, horizon=8)
 DUAL = Contract(image_height=32, image_width=32, horizon=8, feature_dim=12)
@@ -226,14 +222,3 @@ class Wide:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(5)
             self.visual_encoder, self.denoiser = Encoder(), WideDenoiser()
-
-
-def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
-    """Runner and notes of a policy."""
-    policy = load_policy(request, now_s=lambda: 0.0)
-    return policy.runner, "\n".join(policy.notes)
-
-
-def require_same(a: PolicyRunner, b: PolicyRunner) -> None:
-    samples = make_parity_samples(a.contract)
-    assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None

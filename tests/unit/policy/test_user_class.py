@@ -1,17 +1,13 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
+from helpers.loaded_policies import act, load
 from policy.errors import PolicyError
-from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
-
-STATE = np.eye(1, 13, 3, dtype=np.float32)
-HISTORY = np.zeros((1, 4, 4), np.float32)
 
 FLYING = """
 import neighbour
@@ -43,14 +39,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         del sys.modules[name]
 
 
-def load(spec: str, **changes: Any) -> LoadedPolicy:
-    return load_policy(PolicyRequest(spec=spec, **changes), now_s=lambda: 0.0)
-
-
 def throttle(loaded: LoadedPolicy) -> float:
-    rgb = np.full((48, 64, 3), 90, np.uint8)
-    act, encode = loaded.runner.act, loaded.runner.encode
-    return float(act(encode(rgb), STATE, HISTORY)[0, 0, 0])
+    return float(act(loaded.runner)[0, 0])
 
 
 @pytest.mark.parametrize("form", ["./flying.py:Flying", "{}/flying.py:Flying"])
@@ -103,6 +93,7 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
     [
         ("def (:", r"SyntaxError.*broken\.py"),
         ("raise ValueError('no camera here')", r"ValueError: no camera here \(.*broken\.py:1\)"),
+        ("raise SystemExit('no')", r"SystemExit: no \(.*broken\.py:1\)"),
         ("import no_such_library", "install no_such_library beside mavbridge"),
         ("from .neighbour import VALUE", "import its neighbours by their plain names"),
         (

@@ -8,16 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from helpers.torch_policies import (
-    DUAL,
-    SINGLE,
-    Encoder,
-    ForwardOnly,
-    NamedDenoiser,
-    loaded,
-    require_same,
-)
-from policy.engines.choose import make_parity_samples
+from helpers.loaded_policies import act, load, require_same
+from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
@@ -27,6 +19,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning"),
 ]
 
+MINE = "helpers.torch_policies"
 CONTRACT = """
 [contract]
 image_height = 32
@@ -43,20 +36,21 @@ horizon = 8
         ("NamedDenoiser", False),
         ("Wide", True),
         ("Wide", False),
+        ("TwoRates", True),
+        ("PlainClass", False),
+        ("Stepwise", True),
+        ("Stepwise", False),
     ],
 )
-def test_a_class_that_names_its_modules_flies_converted(name: str, dual_rate: bool) -> None:
-    request = PolicyRequest(
-        spec=f"helpers.torch_policies:{name}", dual_rate=dual_rate, num_diffusion_steps=4
-    )
-    runner, notes = loaded(request)
-    assert runner.engine.startswith("openvino"), notes
-    assert runner.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
+def test_a_class_of_torch_modules_flies_converted(name: str, dual_rate: bool) -> None:
+    loaded = load(f"{MINE}:{name}", dual_rate=dual_rate, num_diffusion_steps=4)
+    assert loaded.runner.engine.startswith("openvino"), loaded.notes
+    assert loaded.runner.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
 
 
 def test_modules_that_make_no_policy_are_refused() -> None:
     with pytest.raises(PolicyError, match="it takes forward alone, visual_encoder and action_head"):
-        loaded(PolicyRequest(spec="helpers.torch_policies:Incomplete"))
+        load(f"{MINE}:Incomplete")
 
 
 FORWARD_EXAMPLES = (torch.zeros(1, 3, 32, 32), torch.zeros(1, SINGLE.state_dim))
@@ -92,26 +86,22 @@ def described(**more: object) -> dict[str, object]:
 def test_an_archive_with_named_modules_says_all_of_itself(tmp_path: Path) -> None:
     schedule = {"prediction": "epsilon", "betas": "linear"}
     path = archive(tmp_path, Container(NamedDenoiser()), described(schedule=schedule))
-    request = PolicyRequest(spec=f"torchscript:{path}", num_diffusion_steps=4)
-    assert read_policy_contract(request).horizon == SINGLE.horizon
-    runner, notes = loaded(request)
-    assert runner.engine.startswith("openvino"), notes
-    mine = PolicyRequest(spec="helpers.torch_policies:NamedDenoiser", num_diffusion_steps=4)
-    require_same(runner, loaded(mine)[0])
+    spec = f"torchscript:{path}"
+    assert read_policy_contract(PolicyRequest(spec=spec)).horizon == SINGLE.horizon
+    archived, mine = (load(each, num_diffusion_steps=4) for each in (spec, f"{MINE}:NamedDenoiser"))
+    assert archived.runner.engine.startswith("openvino"), archived.notes
+    require_same(archived.runner, mine.runner)
 
 
 def test_an_archive_with_forward_flies_by_a_contract_file(tmp_path: Path) -> None:
     path = archive(tmp_path, torch.jit.trace(ForwardOnly().eval(), FORWARD_EXAMPLES))
     (tmp_path / "mine.toml").write_text(CONTRACT)
-    request = PolicyRequest(
-        spec=f"torchscript:{path}", contract_file=tmp_path / "mine.toml", dual_rate=False
-    )
-    runner, notes = loaded(request)
-    assert runner.engine.startswith("openvino"), notes
-    mine = PolicyRequest(spec="helpers.torch_policies:ForwardOnly", dual_rate=False)
-    require_same(runner, loaded(mine)[0])
+    spec = f"torchscript:{path}"
+    archived = load(spec, contract_file=tmp_path / "mine.toml", dual_rate=False)
+    assert archived.runner.engine.startswith("openvino"), archived.notes
+    require_same(archived.runner, load(f"{MINE}:ForwardOnly", dual_rate=False).runner)
     with pytest.raises(PolicyError, match=r"give --contract FILE\.toml"):
-        check_request(PolicyRequest(spec=f"torchscript:{path}"))
+        check_request(PolicyRequest(spec=spec))
 
 
 def weights() -> bytes:
@@ -130,12 +120,8 @@ class Branching(nn.Module):
 
 def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     path = archive(tmp_path, Branching(), described())
-    runner, _ = loaded(PolicyRequest(spec=f"torchscript:{path}", dual_rate=False))
-    image = runner.encode(make_parity_samples(SINGLE).rgb[0])
-    history = torch.zeros(1, 4, 4).numpy()
-    for vx, throttle in ((1.0, 0.5), (-1.0, 0.0)):
-        state = torch.tensor([[vx, 0, 0, 1, *[0] * 9]]).numpy()
-        assert runner.act(image, state, history)[0, 0, 0] == throttle
+    runner = load(f"torchscript:{path}", dual_rate=False).runner
+    assert [act(runner, vx_mps=vx)[0, 0] for vx in (1.0, -1.0)] == [0.5, 0.0]
 
 
 @pytest.mark.parametrize(
