@@ -1,4 +1,4 @@
-"""Hooks of a training run on a made-up clock, and the weights that it wrote."""
+"""The smallest world model, hooks of a training run on a made-up clock, and written weights."""
 
 from collections.abc import Callable
 from itertools import count
@@ -6,7 +6,19 @@ from pathlib import Path
 
 from safetensors import safe_open
 
+from policy.contract import Contract
+from policy.nets.world_model.config import WorldModelConfig
 from policy.training.report import Hooks, TrainingProgress
+
+SMALL_WORLD = WorldModelConfig(
+    image_size=32,
+    latent_channels=4,
+    frames=4,
+    autoencoder_widths=(8, 8, 16),
+    dynamics_width=32,
+    dynamics_depth=2,
+    contract=Contract(image_height=32, image_width=32),
+)
 
 
 def make_hooks(

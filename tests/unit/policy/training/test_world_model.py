@@ -11,10 +11,9 @@ import torch
 from safetensors import safe_open
 
 from helpers.steered_flights import steered_flight
-from helpers.training_runs import make_hooks, weights_of
+from helpers.training_runs import SMALL_WORLD, make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY
-from policy.contract import Contract
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
 from policy.nets.world_model.config import WorldModelConfig
@@ -28,16 +27,7 @@ from policy.training.world_model_run import train_world_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-MODEL = WorldModelConfig(
-    image_size=32,
-    latent_channels=4,
-    frames=4,
-    autoencoder_widths=(8, 8, 16),
-    dynamics_width=32,
-    dynamics_depth=2,
-    contract=Contract(image_height=32, image_width=32),
-)
-WIDER = replace(MODEL, autoencoder_widths=(16, 16, 16), dynamics_width=64)
+WIDER = replace(SMALL_WORLD, autoencoder_widths=(16, 16, 16), dynamics_width=64)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +56,7 @@ def run(
     flights: list[FlightData],
     settings: WorldModelSettings,
     report: Callable[[TrainingProgress], None] = lambda _: None,
-    model: WorldModelConfig = MODEL,
+    model: WorldModelConfig = SMALL_WORLD,
 ) -> TrainResult:
     return train_world_model(flights, model, settings, make_hooks(report))
 
@@ -126,7 +116,7 @@ def test_an_autoencoder_that_is_kept_stays_as_it_is(flights, tmp_path):
     assert all(before[name] == after[name] for name in kept)
     assert any(before[name] != after[name] for name in before if name.startswith("dynamics"))
     with pytest.raises(PolicyError, match="latent_channels 4, this model 8"):
-        run(flights, made, model=replace(MODEL, latent_channels=8))
+        run(flights, made, model=replace(SMALL_WORLD, latent_channels=8))
 
 
 def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> FeatureStore:
@@ -144,7 +134,7 @@ def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(tm
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=True)
     asked = settings(tmp_path, seed=3, mirror=True, decision_share=0.25, window_batch_size=64)
-    batches = WindowBatches(windows, latents, MODEL, asked)
+    batches = WindowBatches(windows, latents, SMALL_WORLD, asked)
     batch = batches.batch(5)
     for name, value in vars(batches.batch(5)).items():
         assert torch.equal(value, getattr(batch, name)), name
@@ -180,16 +170,13 @@ def _turn_about_z(states: torch.Tensor) -> torch.Tensor:
 def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=False)
-    model = WorldModel(MODEL)
+    model = WorldModel(SMALL_WORLD)
     for share, decides in ((0.0, False), (1.0, True)):
-        batches = WindowBatches(windows, latents, MODEL, settings(tmp_path, decision_share=share))
+        batches = WindowBatches(
+            windows, latents, SMALL_WORLD, settings(tmp_path, decision_share=share)
+        )
         with torch.inference_mode():
             metrics = dynamics_loss(model, batches.batch(0)).metrics
         assert (float(metrics["sticks"]) > 0) == decides
         assert float(metrics["motion"]) > 0
         assert float(metrics["latents"]) > 0
-
-
-def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="enu_flu states"):
-        run([replace(flights[0], state_frame="enu_flu")], settings(tmp_path))

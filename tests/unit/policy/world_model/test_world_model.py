@@ -7,25 +7,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from policy.contract import QUATERNION, Contract
+from helpers.training_runs import SMALL_WORLD
+from policy.contract import QUATERNION
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.dynamics import Future
 from policy.nets.world_model.model import Imagined, WorldModel
 from policy.nets.world_model.motion import MOTION_DIM
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-SMALL = WorldModelConfig(
-    image_size=32,
-    latent_channels=4,
-    frames=4,
-    autoencoder_widths=(8, 8, 8),
-    dynamics_width=32,
-    dynamics_depth=2,
-    contract=Contract(image_height=32, image_width=32),
-)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +23,7 @@ def model() -> WorldModel:
     """Not to be changed by a test."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        return WorldModel(SMALL).eval()
+        return WorldModel(SMALL_WORLD).eval()
 
 
 def images(count: int, seed: int = 0) -> Tensor:
@@ -101,7 +91,7 @@ def test_frames_are_coded_as_if_they_were_alone(model: WorldModel) -> None:
 def test_gradient_reaches_every_weight() -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = WorldModel(SMALL)
+        model = WorldModel(SMALL_WORLD)
     pixels = torch.randn(2, 3, 32, 32)
     mean, log_variance = model.autoencoder.posterior(pixels)
     loss = model.autoencoder.reconstruct(mean).square().mean() + log_variance.square().mean()
@@ -168,7 +158,7 @@ class KnownYaw(nn.Module):
 
 
 def test_a_network_with_zero_output_shows_the_warped_last_frame() -> None:
-    config = replace(SMALL, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
+    config = replace(SMALL_WORLD, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
     model = WorldModel(config).eval()
     # By the first yaw, a column of cells comes to where its left neighbour was, in the middle.
     yaw_rad = torch.tensor([0.0, 1.0, -1.0, 3.0]) * torch.tensor(8 / 32).atan()
@@ -201,4 +191,4 @@ def test_a_network_with_zero_output_shows_the_warped_last_frame() -> None:
 )
 def test_shapes_that_cannot_be_built_are_refused(changes, says):
     with pytest.raises(PolicyError, match=says):
-        replace(SMALL, **changes)
+        replace(SMALL_WORLD, **changes)
