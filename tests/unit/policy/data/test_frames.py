@@ -20,15 +20,6 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> FlightData:
     return read_flight(write_spot_flight(tmp_path_factory.mktemp("f") / "a", 0, seconds=0.4))
 
 
-def test_images_are_kept_as_they_are_decoded(episode: FlightData, tmp_path: Path) -> None:
-    store = store_frames([episode, episode], tmp_path, 32)
-    assert store.counts == [12, 12]
-    images = np.stack(list(episode.decode()))
-    np.testing.assert_array_equal(
-        store.read(np.arange(6, 18)), np.concatenate([images[6:], images[:6]])
-    )
-
-
 def test_training_and_flight_prepare_images_alike(episode: FlightData, tmp_path: Path) -> None:
     """Stored at the net's size and normalised for a step: the same as image_to_input."""
     contract = Contract(image_height=20, image_width=20)
