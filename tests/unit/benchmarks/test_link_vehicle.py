@@ -1,41 +1,11 @@
-import numpy as np
-
-from benchmarks.link_policy import RollRate
 from benchmarks.link_vehicle import (
     CODES,
-    PARAMS,
     PENDING_LIMIT,
     RoundTrips,
     code_of,
-    code_of_pwm,
     stick_of,
 )
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Sticks
-from mavbridge.mavlink.outputs.echo import DITHER_STEP_NS, EchoCheck
-from mavbridge.mavlink.outputs.sticks import OVERRIDE_ECHO
-from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
-
-DITHER_LEVELS = 3
-
-
-def test_every_code_comes_back_through_policy_calibration_and_dither() -> None:
-    echo = EchoCheck(OVERRIDE_ECHO)
-    echo.sent((1500, 1500, 1500, 1504), 0)
-    echo.received((1500, 1500, 1500, 1504), 1, 1)
-    assert echo.confirmed
-    feature, history = np.zeros((1, 1), np.float32), np.zeros((1, 4, 4), np.float32)
-    state = np.zeros((1, 13), np.float32)
-    for code in range(CODES):
-        state[0, 7] = stick_of(code)
-        chunk = RollRate().predict_fast(feature, state, history, 1)
-        assert chunk.shape == (1, 16, 4)
-        pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
-        dithered_us = {
-            echo.with_dither(pwm_us, level * DITHER_STEP_NS)[3] for level in range(DITHER_LEVELS)
-        }
-        assert len(dithered_us) == DITHER_LEVELS
-        assert {*map(code_of_pwm, dithered_us)} == {code}
 
 
 def test_every_code_comes_back_through_manual_control() -> None:

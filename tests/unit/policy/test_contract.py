@@ -10,10 +10,8 @@ from mavbridge.config.flight import Limits
 from mavbridge.config.rates import Rates
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import observation_ages_ns
-from policy.checkpoints.header import read_contract
 from policy.contract import Contract, history_ages_ns
 from policy.errors import ContractError
-from policy.loading.builtin import SHIPPED
 from policy.preprocess import least_source_px
 
 
@@ -24,13 +22,6 @@ def test_an_older_header_gets_the_defaults_of_what_came_later() -> None:
     assert contract.version == 6
     with pytest.raises(ContractError, match=r"\['speed'\]; there are"):
         Contract.from_json(json.dumps({**header, "speed": 3}))
-
-
-def test_the_shipped_weights_are_read_as_they_are() -> None:
-    contract = read_contract(SHIPPED)
-    assert contract is not None
-    same = {"image_height": 96, "image_width": 96, "feature_dim": 256, "since_exposure": True}
-    assert contract == Contract(**same, max_stall_s=0.35, stops_at_end=True)
 
 
 def test_shapes_grow_by_cameras_observations_and_extras() -> None:

@@ -16,7 +16,6 @@ from policy.engines.choose import (
 from policy.engines.cuda_graph import make_cuda_graph_runner
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
-from policy.nets.names import Size
 from policy.nets.toge import BuiltinPolicy, Toge, TogeConfig
 
 pytestmark = [
@@ -28,26 +27,20 @@ SMALL = Contract(image_height=64, image_width=64)
 ON_GPU = ExecutionSettings(name="toge", device="cuda")
 
 
-def require_parity(policy: BuiltinPolicy) -> None:
+@pytest.mark.parametrize("size", ["shipped", "large"])
+def test_the_graph_computes_what_torch_computes(trained_toge: BuiltinPolicy, size: str) -> None:
+    torch.manual_seed(0)
+    large = TogeConfig(size="large", contract=SMALL)
+    policy = trained_toge if size == "shipped" else Toge(large).eval()
     samples, plain = make_parity_samples(policy.contract), ExecutionSettings(name="t")
     expected = chunks_of_samples(make_torch_runner(policy, plain), samples)
     chunks = chunks_of_samples(make_cuda_graph_runner(policy, ON_GPU), samples)
     assert parity_failure(expected, chunks) is None
 
 
-@pytest.mark.parametrize("size", ["small", "large"])
-def test_toge_computes_what_torch_computes(size: Size) -> None:
-    torch.manual_seed(0)
-    require_parity(Toge(TogeConfig(size=size, contract=SMALL)).eval())
-
-
 def test_the_default_on_a_gpu_is_the_graph(small_toge: Toge) -> None:
     runner, notes = choose_runner(small_toge, "auto", ON_GPU)
     assert runner.engine == "cuda-graph", notes
-
-
-def test_the_shipped_policy_is_that_of_torch(trained_toge: BuiltinPolicy) -> None:
-    require_parity(trained_toge)
 
 
 def test_both_paths_at_once_do_not_touch_each_other(small_toge: Toge) -> None:

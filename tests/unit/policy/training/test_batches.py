@@ -1,35 +1,14 @@
 """Images are encoded once, and disturbed."""
 
 import math
-from pathlib import Path
 
 import numpy as np
-import torch
 
 from policy.training.batches import (
-    ENCODE_BATCH,
     SHARE,
     colour_matrix,
     disturb,
-    encode_frames,
 )
-
-
-def test_images_are_encoded_both_ways(tmp_path: Path) -> None:
-    frames = np.arange(3, 2 * ENCODE_BATCH + 10, 2)
-
-    def encode(part: np.ndarray, is_mirrored: bool) -> torch.Tensor:
-        """Outputs that tell their image; negative where it was mirrored."""
-        return (-1.0 if is_mirrored else 1.0) * torch.from_numpy(part).float()[:, None].expand(
-            -1, 2
-        )
-
-    done: list[float] = []
-    store = encode_frames(tmp_path / "all", frames, encode, mirror=True, progress=done.append)
-    is_mirrored = np.arange(len(frames)) % 3 == 0
-    read = store.read(frames[::-1], is_mirrored)
-    np.testing.assert_array_equal(read[:, 1], np.where(is_mirrored, -1.0, 1.0) * frames[::-1])
-    assert done == sorted(done)
 
 
 def test_images_are_disturbed_and_as_many_left_alone_as_the_shares_say() -> None:

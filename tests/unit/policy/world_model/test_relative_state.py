@@ -5,10 +5,9 @@ import torch
 from torch import Tensor
 
 from helpers.factories import about_z
-from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
+from policy.contract import QUATERNION, VELOCITY, Contract
 from policy.motion import rotation
 from policy.nets.world_model.motion import (
-    MOTION_DIM,
     context_features,
     motion_since,
     state_after,
@@ -36,23 +35,6 @@ def test_a_motion_leads_back_to_the_state() -> None:
     now, then = random_states(500), random_states(500, seed=1)
     again = state_after(now, motion_since(now, then))
     torch.testing.assert_close(again, then, atol=2e-5, rtol=0)
-
-
-def test_a_motion_is_the_rotation_that_the_quaternions_tell() -> None:
-    now, then = random_states(20), random_states(20, seed=1)
-    motion = motion_since(now, then).numpy()
-    assert motion.shape == (20, MOTION_DIM)
-    q_now, q_then = (s[:, QUATERNION].numpy().astype(np.float64) for s in (now, then))
-    turn = rotation.multiply(rotation.conjugate(q_now), q_then)
-    for index, axis in enumerate(np.eye(3)[:2]):
-        column = rotation.rotate(turn, np.broadcast_to(axis, (20, 3)))
-        told = motion[:, 3 + 3 * index : 6 + 3 * index] + axis
-        np.testing.assert_allclose(told, column, atol=1e-5)
-    change = (then - now)[:, VELOCITY].numpy().astype(np.float64)
-    in_body = rotation.rotate(rotation.conjugate(q_now), change)
-    np.testing.assert_allclose(motion[:, :3], in_body, atol=1e-5)
-    np.testing.assert_allclose(motion[:, 9:12], (then - now)[:, RATE], atol=1e-6)
-    np.testing.assert_allclose(motion[:, 12:], (then - now)[:, SPECIFIC_FORCE], atol=1e-6)
 
 
 def test_features_do_not_depend_on_the_heading() -> None:
