@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
-from helpers.recordings import make_meta, without_writer_process
+from helpers.recordings import write_recording
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
@@ -24,9 +24,8 @@ from mavbridge.commands.imagine.loop import (
 )
 from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput, ignore_frame
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
-from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video.file import count_frames
@@ -158,31 +157,22 @@ def segments(sampler: Sampler, plan: RolloutPlan, decider: str) -> Iterator[Segm
 
 
 def write_flight(
-    folder: Path,
-    *,
-    seconds: float = 1.0,
-    camera_hz: float = 30.0,
-    ticks: bool = True,
-    meta: FlightMeta | None = None,
+    folder: Path, *, camera_hz: float = 30.0, ticks: bool = True, meta: FlightMeta | None = None
 ) -> Path:
-    """Write a recorded flight: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with without_writer_process():
-        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
-    writer_ticks = round(100 * seconds) if ticks else 0
-    for index in range(writer_ticks):
+    """Write a flight of a second: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
+    events: list[Tick | VisionTick] = []
+    for index in range(100 if ticks else 0):
         at_ns = START_NS + index * TICK_NS
         values = make_state().values.copy()
         values[0] = index / 100
         sticks = Sticks(throttle=0.0, yaw=index / 1000, pitch=0.0, roll=0.0)
         state = make_state(at_ns, values=values)
-        writer.tick(make_tick(index, state=state, sent=sticks, sent_ns=at_ns))
-    for k in range(round(camera_hz * seconds)):
+        events.append(make_tick(index, state=state, sent=sticks, sent_ns=at_ns))
+    for k in range(round(camera_hz)):
         rgb = np.full((48, 64, 3), grey(k), np.uint8)
         captured_ns = START_NS + round(k / camera_hz * NS_PER_S)
-        writer.frame(make_vision_tick(k + 1, captured_ns=captured_ns, rgb=rgb))
-    writer.finish(writer.meta)
-    return folder
+        events.append(make_vision_tick(k + 1, captured_ns=captured_ns, rgb=rgb))
+    return write_recording(folder, events, meta=meta)
 
 
 def grey(frame: int) -> int:

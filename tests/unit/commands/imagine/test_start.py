@@ -27,7 +27,7 @@ from policy.contract import Contract
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_flight(tmp_path_factory.mktemp("flight") / "a", seconds=1.0)
+    return write_flight(tmp_path_factory.mktemp("flight") / "a")
 
 
 def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight: Path) -> None:
