@@ -5,7 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, GCS, last, named
+from helpers.contract_peers import GCS, last, named, texts_in
 from helpers.copter_companion import (
     ACCEPTED,
     ACRO,
@@ -25,10 +25,6 @@ def modes(messages):
     return [m.custom_mode for m in named(messages, "HEARTBEAT")]
 
 
-def texts(messages):
-    return [m.text for m in named(messages, "STATUSTEXT")]
-
-
 def heartbeat(companion, system_id=GCS):
     companion.send(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), system_id=system_id)
 
@@ -41,7 +37,7 @@ def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(fl
     assert math.degrees(abs(last(released, "ATTITUDE").roll)) < 1.0
     assert last(released, "LOCAL_POSITION_NED").vz == pytest.approx(IDLE_DESCENT_MPS, abs=0.35)
     assert set(modes(held + released)) == {ALT_HOLD}
-    assert not [text for text in texts(held + released) if "ailsafe" in text]
+    assert not [text for text in texts_in(held + released) if "ailsafe" in text]
 
 
 def test_a_short_lifetime_of_overrides_ends_them_sooner(flying):
@@ -64,12 +60,12 @@ def wait_for_text(companion, text):
 
 def test_overrides_are_contact_with_the_ground_station_and_heartbeats_of_others_are_not(flying):
     watch_the_ground_station(flying)
-    assert not [text for text in texts(flying.hold(2.0)) if "GCS" in text]
+    assert not [text for text in texts_in(flying.hold(2.0)) if "GCS" in text]
     messages = []
     for _ in range(20):
         heartbeat(flying, system_id=42)
         messages += flying.advance(0.1)
-    assert "GCS Failsafe - Continuing Pilot Control" in texts(messages)
+    assert "GCS Failsafe - Continuing Pilot Control" in texts_in(messages)
     assert set(modes(messages)) == {ALT_HOLD}
     heartbeat(flying)
     wait_for_text(flying, "GCS Failsafe Cleared")
@@ -115,9 +111,7 @@ def test_without_receiver_arming_needs_overrides(without_receiver):
         pytest.skip("a real vehicle has had sticks since it booted")
     companion.advance(4.0)
     companion.set_mode(ALT_HOLD)
-    companion.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 1, *[0] * 6))
-    text = companion.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:"))
-    assert text.text == "Arm: RC not found"
+    assert companion.arming_refusal() == "Arm: RC not found"
     companion.get_ready(ALT_HOLD)
     assert companion.arm() == ACCEPTED
 
@@ -131,14 +125,14 @@ def test_without_receiver_silence_is_a_radio_failsafe(airborne):
     assert airborne.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
     assert airborne.channels()[0] == 1600
     messages = airborne.hold(1.5)
-    assert "Radio Failsafe Cleared" in texts(messages)
+    assert "Radio Failsafe Cleared" in texts_in(messages)
     assert modes(messages)[-1] == RTL
 
 
 @pytest.mark.parametrize(("gap_s", "fails"), [(0.4, False), (0.9, False), (1.2, True)])
 def test_without_receiver_short_gaps_are_forgiven(airborne, gap_s, fails):
     messages = airborne.advance(gap_s - 0.02)
-    assert ("Radio Failsafe" in texts(messages)) == fails
+    assert ("Radio Failsafe" in texts_in(messages)) == fails
 
 
 def test_manual_throttle_modes_are_refused_in_radio_failsafe(airborne):

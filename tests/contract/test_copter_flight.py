@@ -5,42 +5,33 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, REBOOT_FORCE, is_armed, last, named
+from helpers.contract_peers import REBOOT_FORCE, is_armed, last, named
 from helpers.copter_companion import ACCEPTED, ALT_HOLD, FAILED, STABILIZE
 
 REBOOT = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 
 
-def arming_refusal(companion):
-    companion.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 1, *[0] * 6))
-    return companion.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:")).text
-
-
-def test_arming_is_refused_with_throttle_up(armable):
-    armable.get_ready(STABILIZE)
-    armable.hold(0.1, thr=1300)
-    assert arming_refusal(armable) == "Arm: Throttle too high"
-
-
 @pytest.mark.parametrize(
-    ("sticks", "text"),
+    ("mode", "sticks", "text"),
     [
-        ({"roll": 1700}, "Arm: Roll (RC1) is not neutral"),
-        ({"pitch": 1300}, "Arm: Pitch (RC2) is not neutral"),
-        ({"yaw": 1700}, "Arm: Yaw (RC4) is not neutral"),
+        (STABILIZE, {"thr": 1300}, "Arm: Throttle too high"),
+        (ALT_HOLD, {"thr": 1000, "roll": 1700}, "Arm: Roll (RC1) is not neutral"),
+        (ALT_HOLD, {"thr": 1000, "pitch": 1300}, "Arm: Pitch (RC2) is not neutral"),
+        (ALT_HOLD, {"thr": 1000, "yaw": 1700}, "Arm: Yaw (RC4) is not neutral"),
     ],
 )
-def test_arming_is_refused_off_neutral(armable, sticks, text):
-    armable.get_ready(ALT_HOLD)
-    armable.hold(0.1, thr=1000, **sticks)
-    assert arming_refusal(armable) == text
+def test_arming_is_refused_with_throttle_up_and_off_neutral(armable, mode, sticks, text):
+    armable.get_ready(mode)
+    armable.hold(0.1, **sticks)
+    assert armable.arming_refusal() == text
 
 
-def test_arming_twice_is_accepted(armable):
+def test_arming_twice_is_accepted_and_a_reboot_is_refused_while_armed(armable):
     armable.get_ready(ALT_HOLD)
     assert armable.arm() == ACCEPTED
     armable.hold(0.5, thr=1000)
     assert armable.arm() == ACCEPTED
+    assert armable.command(REBOOT, 1) == FAILED
 
 
 @pytest.mark.parametrize(("throttle_us", "disarms"), [(1000, True), (1500, False)])
@@ -53,12 +44,6 @@ def test_an_idle_vehicle_is_disarmed_with_the_throttle_down(armable, throttle_us
     armed = [is_armed(m) for m in named(armable.hold(2.5, thr=throttle_us), "HEARTBEAT")]
     assert armed[0]
     assert armed[-1] != disarms
-
-
-def test_a_reboot_is_refused_while_armed(armable):
-    armable.get_ready(ALT_HOLD)
-    assert armable.arm() == ACCEPTED
-    assert armable.command(REBOOT, 1) == FAILED
 
 
 @pytest.mark.parametrize(

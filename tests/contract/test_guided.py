@@ -5,7 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, FORCE, is_armed, last, named
+from helpers.contract_peers import ARM, FORCE, is_armed, last, named, texts_in, velocity_target
 from helpers.copter_companion import (
     ACCEPTED,
     ALT_HOLD,
@@ -14,7 +14,6 @@ from helpers.copter_companion import (
     GUIDED_NOGPS,
     LAND,
     RTL,
-    velocity,
 )
 from sitl.vehicle.rotation import from_euler
 
@@ -96,14 +95,14 @@ def test_setpoints_of_any_system_are_followed_without_an_answer(flying, mode):
     messages = stream(flying, attitude(10.0, heading), 1.0, system_id=42)
     assert roll_deg(messages) == pytest.approx(10.0, abs=1.5)
     assert not named(messages, "COMMAND_ACK")
-    assert not [m for m in named(messages, "STATUSTEXT") if "EKF" not in m.text]
+    assert not [text for text in texts_in(messages) if "EKF" not in text]
 
 
 def test_other_modes_ignore_setpoints(flying):
     in_the_air(flying, ALT_HOLD)
     flying.hold(0.5)
     flying.send(attitude(20.0))
-    flying.send(velocity(3.0))
+    flying.send(velocity_target(3.0))
     messages = flying.hold(1.5)
     assert roll_deg(messages) == pytest.approx(0.0, abs=1.5)
 
@@ -195,7 +194,7 @@ def test_the_frame_decides_on_the_axes_of_a_velocity(flying, frame, is_body):
     in_the_air(flying)
     if not 80.0 < yaw_deg(flying.advance(0.1)) < 100.0:  # else the frame before has turned it
         stream(flying, attitude(yaw_deg=90.0), 3.0)
-    messages = stream(flying, velocity(1.0, frame=frame), 3.0)
+    messages = stream(flying, velocity_target(1.0, frame=frame), 3.0)
     heading = math.radians(yaw_deg(messages))
     north, east = (math.cos(heading), math.sin(heading)) if is_body else (1.0, 0.0)
     assert speed_ned(messages)[:2] == pytest.approx((north, east), abs=0.2)
@@ -206,20 +205,20 @@ def test_the_frame_decides_on_the_axes_of_a_velocity(flying, frame, is_body):
 
 def test_velocity_and_yaw_rate_take_their_measured_time(flying):
     in_the_air(flying)
-    still = stream(flying, velocity(), 1.0)
+    still = stream(flying, velocity_target(), 1.0)
     start_ms = last(still, "LOCAL_POSITION_NED").time_boot_ms
-    messages = stream(flying, velocity(2.0), 3.0)
+    messages = stream(flying, velocity_target(2.0), 3.0)
     reached_ms = next(m.time_boot_ms for m in named(messages, "LOCAL_POSITION_NED") if m.vx >= 1.26)
     assert reached_ms - start_ms == pytest.approx(865, abs=120)
     assert speed_ned(messages)[0] == pytest.approx(2.0, abs=0.1)
-    turning = stream(flying, velocity(yaw_degps=30.0), 2.0)
+    turning = stream(flying, velocity_target(yaw_rate_deg=30.0), 2.0)
     assert math.degrees(last(turning, "ATTITUDE").yawspeed) == pytest.approx(30.0, abs=3.0)
 
 
 def test_a_velocity_that_stops_is_held_until_the_timeout(flying):
     in_the_air(flying)
     flying.set_param("GUID_TIMEOUT", 1.0)
-    stream(flying, velocity(1.0), 2.5)
+    stream(flying, velocity_target(1.0), 2.5)
     assert speed_ned(flying.advance(0.8))[0] == pytest.approx(1.0, abs=0.15)
     assert math.hypot(*speed_ned(flying.advance(2.2))) < 0.3
 
@@ -227,10 +226,13 @@ def test_a_velocity_that_stops_is_held_until_the_timeout(flying):
 def test_a_velocity_does_not_lift_off_and_ends_a_takeoff(grounded):
     armed_on_the_ground(grounded, GUIDED)
     start_m = last(grounded.advance(0.2), "LOCAL_POSITION_NED").z
-    assert start_m - last(stream(grounded, velocity(z=-1.0), 3.0), "LOCAL_POSITION_NED").z < 0.3
+    assert (
+        start_m - last(stream(grounded, velocity_target(vz=-1.0), 3.0), "LOCAL_POSITION_NED").z
+        < 0.3
+    )
     assert grounded.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, 8.0) == ACCEPTED
     grounded.advance(3.2)
-    messages = stream(grounded, velocity(), 3.0)
+    messages = stream(grounded, velocity_target(), 3.0)
     assert 1.0 < start_m - last(messages, "LOCAL_POSITION_NED").z < 7.0
     assert grounded.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, 12.0) == FAILED
 
@@ -277,24 +279,22 @@ def test_attitude_target_has_the_shaped_target_and_the_thrust(flying):
     assert 0.2 < target.thrust < 0.6
 
 
-def test_without_receiver_setpoints_do_not_stop_the_radio_failsafe(without_receiver):
+@pytest.mark.parametrize(
+    ("options", "mode", "text"),
+    [
+        (None, RTL, "Radio Failsafe"),
+        (4, GUIDED_NOGPS, "Radio Failsafe - Continuing Guided Mode"),
+    ],
+)
+def test_without_receiver_setpoints_alone_need_an_option(without_receiver, options, mode, text):
     companion = without_receiver
     companion.fly_up(GUIDED_NOGPS)
     companion.override(1500, 1500, 1500, 1500)
-    messages = stream(companion, attitude(), 1.6)
-    assert "Radio Failsafe" in [m.text for m in named(messages, "STATUSTEXT")]
-    assert last(messages, "HEARTBEAT").custom_mode == RTL
-
-
-def test_an_option_lets_guided_go_on_without_sticks(without_receiver):
-    companion = without_receiver
-    companion.fly_up(GUIDED_NOGPS)
-    companion.override(1500, 1500, 1500, 1500)
-    companion.set_param("FS_OPTIONS", 4)
+    if options is not None:
+        companion.set_param("FS_OPTIONS", options)
     messages = stream(companion, attitude(), 2.6)
-    texts = [m.text for m in named(messages, "STATUSTEXT")]
-    assert texts == ["Radio Failsafe - Continuing Guided Mode"]
-    assert last(messages, "HEARTBEAT").custom_mode == GUIDED_NOGPS
+    assert [each for each in texts_in(messages) if "Failsafe" in each] == [text]
+    assert last(messages, "HEARTBEAT").custom_mode == mode
 
 
 def test_without_receiver_and_its_failsafe_setpoints_alone_arm_and_fly(without_receiver):

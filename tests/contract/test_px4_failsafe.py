@@ -46,15 +46,11 @@ def take_off_by_setpoints(px4):
     px4.stream_setpoint(attitude_target(thrust=0.65), 4.0)
 
 
-def send_mid(px4):
-    return lambda _: px4.sticks(MID)
-
-
 @pytest.mark.parametrize(("gap_s", "fails"), [(0.3, False), (0.5, False), (0.8, True)])
 def test_a_short_gap_is_forgiven(px4_flying, gap_s, fails):
     px4_flying.refill_delay()
     px4_flying.advance(gap_s)
-    assert px4_flying.hears(HOLD_TEXT, 1.0, send_mid(px4_flying)) == fails
+    assert px4_flying.hears(HOLD_TEXT, 1.0, px4_flying.holding()) == fails
 
 
 def test_lost_sticks_are_held_then_hold_then_return(px4_flying):
@@ -77,7 +73,7 @@ def test_lost_sticks_are_held_then_hold_then_return(px4_flying):
 def test_returning_sticks_do_not_give_the_mode_back(px4_flying):
     px4_flying.refill_delay(2.0)
     goes_to(px4_flying, LOITER, 2.0)
-    assert goes_to(px4_flying, RTL, 7.0, send_mid(px4_flying)) <= 2.6
+    assert goes_to(px4_flying, RTL, 7.0, px4_flying.holding()) <= 2.6
     px4_flying.fly(1.0)
     assert px4_flying.mode() == custom(RTL)
 
@@ -143,9 +139,9 @@ def test_offboard_needs_a_setpoint_in_flight(px4_flying):
     px4_flying.fly(1.2)  # a setpoint of the flight before may still count
     text = "Switching to Offboard is currently not available"
     assert px4_flying.set_mode(OFFBOARD) == REJECTED
-    assert not px4_flying.hears(text, 1.2, send_mid(px4_flying)), "only a ground station is told"
+    assert not px4_flying.hears(text, 1.2, px4_flying.holding()), "only a ground station is told"
     assert px4_flying.set_mode(OFFBOARD, component_id=mav.MAV_COMP_ID_MISSIONPLANNER) == REJECTED
-    assert px4_flying.hears(text, 2.0, send_mid(px4_flying))
+    assert px4_flying.hears(text, 2.0, px4_flying.holding())
     px4_flying.send(attitude_target())
     px4_flying.advance(0.3)
     assert px4_flying.set_mode(OFFBOARD) == ACCEPTED, "one setpoint within a second is enough"
@@ -156,7 +152,7 @@ def test_a_lost_stream_leaves_offboard_and_its_return_brings_it_back(px4_flying)
     assert px4_flying.set_mode(OFFBOARD) == ACCEPTED
     messages = px4_flying.repeat(both(px4_flying, attitude_target(10.0)), 1.5)
     assert math.degrees(named(messages, "ATTITUDE")[-1].roll) == pytest.approx(10.0, abs=1.0)
-    assert 0.95 <= goes_to(px4_flying, POSCTL, 2.0, send_mid(px4_flying)) <= 1.25
+    assert 0.95 <= goes_to(px4_flying, POSCTL, 2.0, px4_flying.holding()) <= 1.25
     assert modes_in(px4_flying.fly(1.0))[-1].intended_custom_mode == custom(OFFBOARD)
     assert goes_to(px4_flying, OFFBOARD, 1.0, both(px4_flying, attitude_target())) < 0.2
 

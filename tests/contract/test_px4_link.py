@@ -3,6 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import rate_hz
 from helpers.px4_companion import (
     ACCEPTED,
     ALTCTL,
@@ -28,8 +29,7 @@ def test_heartbeats_stay_at_one_hertz(px4):
 
     def change_modes(elapsed_s: float) -> None:
         mode = ALTCTL if int(elapsed_s * 5.0) % 2 else LOITER
-        params = (1, *mode, 0, 0, 0, 0)
-        px4.send(mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_DO_SET_MODE, 0, *params))
+        px4.send_command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
 
     messages = px4.repeat(change_modes, 3.0, hz=5)
     assert len(named(messages, "HEARTBEAT")) == pytest.approx(3, abs=1)
@@ -74,13 +74,7 @@ def test_state_streams_at_the_requested_rate_up_to_that_of_its_topic(
     px4.advance(0.3)
     name = mav.mavlink_map[message_id].msgname
     messages = named(px4.repeat(lambda _: None, 2.0), name)
-    if hasattr(messages[0], "time_usec"):
-        span_s = (messages[-1].time_usec - messages[0].time_usec) / 1e6
-    elif hasattr(messages[0], "time_boot_ms"):
-        span_s = (messages[-1].time_boot_ms - messages[0].time_boot_ms) / 1e3
-    else:
-        span_s = 2.0
-    assert low_hz <= (len(messages) - 1) / span_s <= high_hz
+    assert low_hz <= rate_hz(messages, 2.0) <= high_hz
 
 
 @pytest.mark.parametrize("message_id", [0, 27, 35, 60_000])
@@ -90,13 +84,7 @@ def test_a_message_that_cannot_be_streamed_fails(px4, message_id):
 
 def test_the_interval_is_reported(px4):
     px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
-    px4.send(
-        mav.MAVLink_command_long_message(
-            1, 1, mav.MAV_CMD_GET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, *[0] * 6
-        )
-    )
-    interval = px4.wait("MESSAGE_INTERVAL")
-    assert (interval.message_id, interval.interval_us) == (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000)
+    assert px4.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE) == 20_000
 
 
 def test_an_integer_travels_as_its_bytes(px4):

@@ -5,18 +5,17 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import velocity_target
 from helpers.px4_companion import (
     ACCEPTED,
     LAND,
     LOITER,
-    MID,
     OFFBOARD,
     TAKEOFF,
     attitude_target,
     custom,
     named,
     rate_target,
-    velocity_target,
 )
 
 
@@ -127,16 +126,16 @@ def test_the_vehicle_takes_off_holds_and_lands_by_itself(px4_grounded):
     px4_grounded.until(
         lambda m: any(x.landed_state == 2 for x in named(m, "EXTENDED_SYS_STATE")),
         20.0,
-        lambda _: px4_grounded.sticks(MID),
+        px4_grounded.holding(),
     )
     messages = px4_grounded.fly(2.0)
     height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
     assert px4_grounded.mode() == custom(LOITER)
     assert height == pytest.approx(2.5, abs=0.8)
     assert px4_grounded.set_mode(LAND) == ACCEPTED
-    px4_grounded.until(has_said("Landing detected"), 20.0, lambda _: px4_grounded.sticks(MID))
+    px4_grounded.until(has_said("Landing detected"), 20.0, px4_grounded.holding())
     disarmed = has_said("Disarmed by landing")
-    took_s, _ = px4_grounded.until(disarmed, 5.0, lambda _: px4_grounded.sticks(MID))
+    took_s, _ = px4_grounded.until(disarmed, 5.0, px4_grounded.holding())
     assert 1.7 <= took_s <= 2.6
     px4_grounded.fly(0.5)
     assert px4_grounded.mode() == custom(LOITER), "the last one that can arm"

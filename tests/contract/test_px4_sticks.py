@@ -109,7 +109,7 @@ def test_arming_needs_a_low_throttle(px4_armable, mode, z, result):
     px4_armable.seen.clear()
     assert px4_armable.arm() == result
     denied = px4_armable.hears(
-        "Arming denied: throttle not in safe position", 0.7, lambda _: px4_armable.sticks(sticks)
+        "Arming denied: throttle not in safe position", 0.7, px4_armable.holding(sticks)
     )
     assert denied == (result == REJECTED)
 
@@ -119,12 +119,10 @@ def test_throttle_down_and_full_yaw_arms_and_disarms(px4_armable):
     px4_armable.seen.clear()
     px4_armable.fly(0.8, (0, 0, 0, 1000))
     assert "Armed by stick gesture" not in px4_armable.texts()
-    assert px4_armable.hears(
-        "Armed by stick gesture", 1.5, lambda _: px4_armable.sticks((0, 0, 0, 1000))
-    )
+    assert px4_armable.hears("Armed by stick gesture", 1.5, px4_armable.holding((0, 0, 0, 1000)))
     px4_armable.seen.clear()
     assert px4_armable.hears(
-        "Disarmed by stick gesture", 2.5, lambda _: px4_armable.sticks((0, 0, 0, -1000))
+        "Disarmed by stick gesture", 2.5, px4_armable.holding((0, 0, 0, -1000))
     )
 
 
@@ -135,7 +133,7 @@ def test_an_idle_vehicle_is_disarmed(px4_armable):
     took_s, _ = px4_armable.until(
         lambda m: any("Disarmed" in x.text for x in named(m, "STATUSTEXT")),
         8.0,
-        lambda _: px4_armable.sticks(MID),
+        px4_armable.holding(),
     )
     assert 3.8 <= took_s <= 5.5
 
@@ -196,7 +194,5 @@ def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4_flying):
 
 def test_in_flight_only_a_forced_disarm_works(px4_expendable):
     assert px4_expendable.command(ARM, 0) == REJECTED
-    assert px4_expendable.hears(
-        "Disarming denied: not landed", 2.0, lambda _: px4_expendable.sticks(MID)
-    )
+    assert px4_expendable.hears("Disarming denied: not landed", 2.0, px4_expendable.holding())
     assert px4_expendable.command(ARM, 0, 21196, system_id=42) == ACCEPTED

@@ -1,5 +1,6 @@
 """Flight controllers of the contract suite, and a companion that talks to them."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -16,6 +17,8 @@ TICK_NS = 5 * NS_PER_MS
 ARM = mav.MAV_CMD_COMPONENT_ARM_DISARM
 FORCE = 21196
 REBOOT_FORCE = 20190226
+VELOCITY_MASK = 0x5C7
+"""All fields ignored but a velocity and a yaw rate."""
 
 
 class Peer(Protocol):
@@ -135,12 +138,18 @@ class Companion:
         message = self.find(name, timeout_s, where)
         return message or pytest.fail(f"no such {name} within {timeout_s} s")
 
+    def send_command(
+        self, number: int, *params: float, attempt: int = 0, system_id: int = GCS
+    ) -> None:
+        """Send a command; its ack is left among the messages."""
+        padded = (*params, *[0.0] * (7 - len(params)))
+        message = mav.MAVLink_command_long_message(1, 1, number, attempt, *padded)
+        self.send(message, system_id=system_id)
+
     def command(self, number: int, *params: float, system_id: int = GCS) -> int:
         """Send a command, and repeat it if its ack is lost; return the result in the ack."""
-        padded = (*params, *[0.0] * (7 - len(params)))
         for attempt in range(3):
-            message = mav.MAVLink_command_long_message(1, 1, number, attempt, *padded)
-            self.send(message, system_id=system_id)
+            self.send_command(number, *params, attempt=attempt, system_id=system_id)
             ack = self.find("COMMAND_ACK", 1.0, lambda m: m.command == number)
             if ack is not None:
                 return int(ack.result)
@@ -149,9 +158,7 @@ class Companion:
     def request(self, message_id: int, name: str) -> Any:
         """Request a message by MAV_CMD_REQUEST_MESSAGE, and return it."""
         for _ in range(3):
-            params = (message_id, *[0.0] * 6)
-            number = mav.MAV_CMD_REQUEST_MESSAGE
-            self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *params))
+            self.send_command(mav.MAV_CMD_REQUEST_MESSAGE, message_id)
             message = self.find(name, 1.0)
             if message is not None:
                 return message
@@ -161,6 +168,13 @@ class Companion:
         """Request a rate; it is reset at the end of the test."""
         self._streams.add(message_id)
         return self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, int(1e6 / rate_hz))
+
+    def interval_us(self, message_id: int) -> int:
+        """Return the interval at which the vehicle says it sends a message."""
+        self.send_command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, message_id)
+        interval = self.wait("MESSAGE_INTERVAL")
+        assert interval.message_id == message_id
+        return int(interval.interval_us)
 
     def arm(self) -> int:
         return self.command(ARM, 1)
@@ -216,6 +230,18 @@ class Companion:
             self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0)
 
 
+def velocity_target(
+    vx: float = 0.0,
+    vy: float = 0.0,
+    vz: float = 0.0,
+    yaw_rate_deg: float = 0.0,
+    frame: int = mav.MAV_FRAME_LOCAL_NED,
+) -> Any:
+    """Return a setpoint of only a velocity in m/s and a yaw rate in deg/s."""
+    motion = (0, 0, 0, vx, vy, vz, 0, 0, 0, 0, math.radians(yaw_rate_deg))
+    return mav.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, VELOCITY_MASK, *motion)
+
+
 def named(messages: list[Any], name: str) -> list[Any]:
     """Return the messages of that name, in order."""
     return [message for message in messages if message.get_type() == name]
@@ -224,6 +250,24 @@ def named(messages: list[Any], name: str) -> list[Any]:
 def last(messages: list[Any], name: str) -> Any:
     """Return the newest message of that name."""
     return named(messages, name)[-1]
+
+
+def texts_in(messages: list[Any]) -> list[str]:
+    """Return the status texts, one of at most 50 characters a message."""
+    return [message.text for message in named(messages, "STATUSTEXT")]
+
+
+def rate_hz(messages: list[Any], heard_s: float) -> float:
+    """Return the rate of messages by their own stamps: a busy computer delays their arrival.
+
+    Messages without a stamp were heard for ``heard_s``.
+    """
+    first, newest = messages[0], messages[-1]
+    if hasattr(first, "time_usec"):
+        heard_s = (newest.time_usec - first.time_usec) / 1e6
+    elif hasattr(first, "time_boot_ms"):
+        heard_s = (newest.time_boot_ms - first.time_boot_ms) / 1e3
+    return (len(messages) - 1) / heard_s
 
 
 def is_armed(heartbeat: Any) -> bool:

@@ -1,11 +1,10 @@
 """Ground station or companion computer of an ArduCopter: overrides, modes, how to fly up."""
 
-import math
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import ARM, GCS, Companion, named
+from helpers.contract_peers import ARM, GCS, Companion, named, texts_in, velocity_target
 
 STABILIZE, ACRO, ALT_HOLD, GUIDED, LOITER, RTL, LAND = 0, 1, 2, 4, 5, 6, 9
 POSHOLD, BRAKE, GUIDED_NOGPS = 16, 17, 20
@@ -15,7 +14,6 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
     mav.MAV_RESULT_UNSUPPORTED,
     mav.MAV_RESULT_FAILED,
 )
-VELOCITY_MASK = 1479
 HEIGHT_M = 8.0
 TOO_LOW_M, TOO_HIGH_M = 2.0, 15.0  # relative to the wanted height; a descent takes long
 STILL_MPS = 0.25
@@ -60,8 +58,7 @@ class CopterCompanion(Companion):
         assert self.set_mode(mode) == ACCEPTED
         self.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20)
         for _ in range(300):
-            params = (mav.MAVLINK_MSG_ID_SYS_STATUS, 0, 0, 0, 0, 0, 0)
-            self.send(mav.MAVLink_command_long_message(1, 1, 512, 0, *params))
+            self.send_command(mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_SYS_STATUS)
             messages = self.hold(0.2, thr=1000)
             has_position = bool(named(messages, "LOCAL_POSITION_NED"))
             health = [m.onboard_control_sensors_health for m in named(messages, "SYS_STATUS")]
@@ -89,7 +86,12 @@ class CopterCompanion(Companion):
 
     def texts(self) -> list[str]:
         """Return the status texts since ``seen`` was cleared."""
-        return [m.text for m in named(self.seen, "STATUSTEXT")]
+        return texts_in(self.seen)
+
+    def arming_refusal(self) -> str:
+        """Ask for arming; return the text that says why not."""
+        self.send_command(ARM, 1)
+        return str(self.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:")).text)
 
     def _take_off(self) -> None:
         self.get_ready(GUIDED, needs_position=True)
@@ -110,7 +112,7 @@ class CopterCompanion(Companion):
                 if is_there and max(speeds_mps) < STILL_MPS:
                     return
                 up_mps = 0.0 if is_there else max(-2.5, min(2.5, too_low_m))
-                self.send(velocity(z=-up_mps))
+                self.send(velocity_target(vz=-up_mps))
         raise AssertionError("the vehicle does not come to rest")
 
     def come_down(self) -> None:
@@ -131,15 +133,3 @@ class CopterCompanion(Companion):
             self.command(ARM, 0)
         self.override(*[0] * 8)
         self.advance(0.02)
-
-
-def velocity(
-    x: float = 0.0,
-    z: float = 0.0,
-    *,
-    yaw_degps: float = 0.0,
-    frame: int = mav.MAV_FRAME_LOCAL_NED,
-) -> Any:
-    """Return SET_POSITION_TARGET_LOCAL_NED with only a velocity in m/s and a yaw rate in deg/s."""
-    motion = (*[0] * 3, x, 0, z, *[0] * 4, math.radians(yaw_degps))
-    return mav.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, VELOCITY_MASK, *motion)

@@ -17,7 +17,6 @@ TAKEOFF, LOITER, RTL, LAND = (4, 2), (4, 3), (4, 5), (4, 6)
 MID = (0, 0, 500, 0)
 EVENT, CURRENT_MODE = 410, 436
 STICK_HZ = 50
-VELOCITY_AND_YAW_RATE = 0x5C7
 HOVER_THRUST = 0.484
 LOWEST_M, HIGHEST_M, STILL_MPS = 5.0, 40.0, 0.3
 
@@ -60,15 +59,6 @@ def rate_target(yaw_degps: float) -> Any:
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates)
 
 
-def velocity_target(
-    vx: float = 0.0, vy: float = 0.0, vz: float = 0.0, yaw_rate_deg: float = 0.0, frame: int = 1
-) -> Any:
-    return mav.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, frame, VELOCITY_AND_YAW_RATE, 0, 0, 0, vx, vy, vz, 0, 0, 0, 0,
-        math.radians(yaw_rate_deg),
-    )  # fmt: skip
-
-
 class Px4Companion(Companion):
     """`Companion` for PX4; sends a ground station's heartbeat once a second."""
 
@@ -95,6 +85,10 @@ class Px4Companion(Companion):
         """Send MANUAL_CONTROL: x, y, z, r."""
         self.send(mav.MAVLink_manual_control_message(1, *sticks, 0), system_id=system_id)
 
+    def holding(self, sticks: tuple[int, int, int, int] = MID) -> Callable[[float], None]:
+        """Return a function that sends these sticks, for ``repeat``, ``until`` and ``hears``."""
+        return lambda _: self.sticks(sticks)
+
     def repeat(
         self, send: Callable[[float], None], seconds: float, hz: float = STICK_HZ
     ) -> list[Any]:
@@ -110,7 +104,7 @@ class Px4Companion(Companion):
         return messages
 
     def fly(self, seconds: float, sticks: tuple[int, int, int, int] = MID) -> list[Any]:
-        return self.repeat(lambda _: self.sticks(sticks), seconds)
+        return self.repeat(self.holding(sticks), seconds)
 
     def stream_setpoint(self, message: Any, seconds: float, hz: float = STICK_HZ) -> list[Any]:
         return self.repeat(lambda _: self.send(message), seconds, hz)
@@ -166,7 +160,7 @@ class Px4Companion(Companion):
             self.get_ready(ALTCTL)
             assert self.arm() == ACCEPTED
             is_up = lambda m: any(p.z < -6.0 for p in named(m, "LOCAL_POSITION_NED"))  # noqa: E731
-            self.until(is_up, 25.0, lambda _: self.sticks((0, 0, 1000, 0)))
+            self.until(is_up, 25.0, self.holding((0, 0, 1000, 0)))
         self._settle()
         self._take(mode)
         self.fly(0.1)
