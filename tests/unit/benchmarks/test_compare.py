@@ -91,6 +91,7 @@ def test_exit_status_tells_whether_the_budget_holds(
     for text in ("15.00 / 61.00", "599 of 600", "0.60 / 0.60 / 0.60", "not measured"):
         assert text in out
     assert json.loads(figures.read_text())["flight"]["computer"]["cpu"] == "some cpu"
+    assert compare.main() == 0, "nothing is over a budget that is not given"
 
 
 def test_a_ratio_that_is_not_a_number_is_over_any_budget() -> None:
