@@ -18,7 +18,7 @@ from mavbridge.core.vehicle import (
     StickGains,
     Sticks,
 )
-from mavbridge.mavlink.codec.messages import ManualControl, RcChannels
+from mavbridge.mavlink.codec.messages import ManualControl
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.outputs.sender import choose_output
 from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
@@ -56,21 +56,6 @@ def echo(flight: Flight, action: Sticks, *, lost: int = 0) -> None:
 
 
 # --- curves
-
-
-def test_sticks_mean_to_the_vehicle_what_they_meant_in_training() -> None:
-    raw, mapped = px4_flight(), px4_flight(StickGains())
-    message: Any = raw.message(raw.send(WANTED))
-    assert (message.x, message.y, message.z) == (100, -300, 750)
-    encoded = mapped.send(WANTED)
-    message = mapped.message(encoded)
-    curves = PX4.stick_curves(PX4_VALUES, "ALTCTL", StickGains())
-    throttle, yaw, pitch, roll = curves.to_vehicle(WANTED)
-    assert abs(message.r - 1000 * yaw) <= 9  # and the dither
-    expected = (1000 * pitch, 1000 * roll, 500 * (throttle + 1))
-    assert (message.x, message.y, message.z) == pytest.approx(expected, abs=0.51)
-    assert yaw > 2 * WANTED.yaw
-    assert encoded.action == pytest.approx(WANTED, abs=0.01)
 
 
 def test_the_curves_follow_the_mode_at_once_and_the_parameters_soon() -> None:
@@ -161,10 +146,14 @@ def test_what_px4_acts_on_instead_of_our_sticks_is_told(
     assert flight.now_ns - since_ns < 500 * MS
 
 
+NEUTRAL_SENT = (0, 0, 500, 0)
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
 @pytest.mark.parametrize(
     ("mode", "has_receiver", "last"),
     [
-        ("ALTCTL", False, (0, 0, 500, 0)),
+        ("ALTCTL", False, NEUTRAL_SENT),
         ("STABILIZED", False, (0, 0, 650, 0)),  # where the middle of the throttle is thrust
         ("ALTCTL", True, None),
         ("AUTO.LOITER", False, None),  # which would take them for a pilot's hand
@@ -172,35 +161,19 @@ def test_what_px4_acts_on_instead_of_our_sticks_is_told(
     ],
 )
 def test_the_last_sticks_are_neutral_ones_where_nobody_elses_are_flown(
-    mode: str, has_receiver: bool, last: tuple[int, ...] | None
+    mode: str, has_receiver: bool, last: tuple[int, ...] | None, is_restarted: bool
 ) -> None:
+    """Also of a session that starts over in the air: a reboot may be but a wrong stamp."""
     flight = px4_flight()
     flight.vehicle.mode, flight.vehicle.has_receiver = mode, has_receiver
+    assert flight.status.mode == mode
     flight.send(Sticks(0.3, 0.2, 0.5, -0.5))
+    if is_restarted:
+        flight.output.restart()
+        flight.vehicle.is_known = False
     packet = flight.output.release_packet(flight.session, flight.now_ns)
-    if last is None:
-        assert packet is None
-        return
-    assert packet is not None
-    ((message),) = flight.end.read(packet)
-    assert (message.x, message.y, message.z, message.r) == last
-
-
-@pytest.mark.parametrize(("has_receiver", "is_levelled"), [(False, True), (True, False)])
-def test_a_session_that_starts_over_in_the_air_still_ends_with_neutral_sticks(
-    has_receiver: bool, is_levelled: bool
-) -> None:
-    """A reboot may be but a wrong stamp: what was known of the vehicle before it counts."""
-    flight = px4_flight()
-    flight.vehicle.mode, flight.vehicle.has_receiver = "ALTCTL", has_receiver
-    assert flight.status.mode == "ALTCTL"
-    flight.send(Sticks(0.3, 0.2, 0.5, -0.5))
-    flight.output.restart()
-    flight.vehicle.is_known = False
-    packet = flight.output.release_packet(flight.session, flight.now_ns)
-    assert (packet is not None) is is_levelled
-    for message in flight.end.read(packet or b""):
-        assert (message.x, message.y, message.z, message.r) == (0, 0, 500, 0)
+    sent = [(m.x, m.y, m.z, m.r) for m in flight.end.read(packet or b"")]
+    assert sent == ([] if last is None else [last])
 
 
 def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:
@@ -233,17 +206,6 @@ def test_sticks_are_released_once_others_are_shown_or_none() -> None:
 # --- overrides
 
 
-def test_overrides_hide_the_receiver_from_the_first_one_on() -> None:
-    flight = copter_flight()
-    rest = RcChannels((1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500), 1)
-    flight.receive(rest)
-    assert not flight.vehicle.condition.is_receiver_hidden
-    flight.send(NEUTRAL)
-    flight.receive(rest._replace(boot_us=2))
-    assert flight.vehicle.condition.is_receiver_hidden
-    assert not flight.vehicle.condition.is_released
-
-
 def test_other_actions_than_sticks_are_refused() -> None:
     for flight in (px4_flight(), copter_flight()):
         with pytest.raises(CommandRefusedError, match="not sticks"):
@@ -251,21 +213,6 @@ def test_other_actions_than_sticks_are_refused() -> None:
 
 
 # --- the choice
-
-
-@pytest.mark.parametrize(
-    ("profile", "kind", "name"),
-    [
-        (ARDUPILOT, "sticks", "rc-override"),
-        (PX4, "sticks", "manual-control"),
-        *((PX4, kind, kind) for kind in ("attitude", "rates", "velocity")),
-    ],
-)
-def test_the_usual_output_follows_from_action_and_firmware(
-    profile: Profile, kind: ActionKind, name: Output
-) -> None:
-    chosen = choose_output(ActionMeaning(kind=kind), None, profile, codec())
-    assert (chosen.name, chosen.is_sticks) == (name, kind == "sticks")
 
 
 @pytest.mark.parametrize(
