@@ -135,63 +135,99 @@ class Session:
         return status
 
 
-# --- heartbeat, landing, battery
+# --- what its messages tell
 
-
-def test_a_failsafe_is_told_by_the_heartbeat() -> None:
-    session = Session()
-    for system_status in range(9):
-        session.put(Heartbeat(2, 3, 81, 2, system_status))
-        assert session.status.is_failsafe is (system_status >= 5)
-
-
-@pytest.mark.parametrize(
-    ("state", "expected"), [(0, None), (1, True), (2, False), (3, False), (4, False)]
-)
-def test_landed_is_what_the_vehicle_says_and_not_for_ever(
-    state: int, expected: bool | None
-) -> None:
-    session = Session()
-    assert session.status.is_landed is None
-    session.put(LandedState(state))
-    assert session.status.is_landed is expected
-    session.now_ns += 2 * S
-    assert session.status.is_landed is expected
-    session.now_ns += MS
-    assert session.status.is_landed is None
-
-
-@pytest.mark.parametrize(
-    ("system", "expected"),
-    [
-        (SystemStatus(BATTERY_BIT, BATTERY_BIT, 80), None),
-        (SystemStatus(BATTERY_BIT, 0, 80), because(Code.BATTERY)),
-        (SystemStatus(0, 0, 80), None),  # no battery monitor
-        (SystemStatus(0, 0, -1), None),
-        (SystemStatus(BATTERY_BIT, BATTERY_BIT, 15), None),
-        (
-            SystemStatus(BATTERY_BIT, BATTERY_BIT, 14),
-            because(Code.BATTERY_BELOW, percent=14, limit=15),
-        ),
-    ],
-)
-def test_the_battery(system: SystemStatus, expected: Reason | None) -> None:
-    session = Session(min_battery_percent=15.0)
-    session.put(system)
-    assert session.status.battery_problem == expected
-    session.now_ns += 3 * S
-    assert session.status.battery_problem is None
-
-
-# --- PX4: CURRENT_MODE and EVENT are faster than HEARTBEAT
-
+BOTH = ("ardupilot", "px4")
 ALTCTL, POSCTL, RTL = 2 << 16, 3 << 16, 4 << 16 | 5 << 24
 LOITER, LAND = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
 ARMED_BY, DISARMED_BY, FAILSAFE_HOLD = 0x190CAF3, 0x1F46777, 0x1D11DF6
+PX4_ON_GROUND = 0x3FF
+"""Estimator flags with GPS, CONST_POS_MODE among them; in the air 0x37F."""
+CONSTANT = dialect.ESTIMATOR_CONST_POS_MODE
+POSITION = (1.0, 2.0, -3.0)
 
 
 def beat(mode: int, *, armed: bool = True, state: int = 4) -> Heartbeat:
     return Heartbeat(2, 12, 81 | 128 * armed, mode, state)
+
+
+def battery(present: int, healthy: int, percent: int) -> SystemStatus:
+    return SystemStatus(present and BATTERY_BIT, healthy and BATTERY_BIT, percent)
+
+
+Told = tuple[tuple[str, ...], list[Body], dict[str, Any]]
+TOLD: list[Told] = [
+    *((BOTH, [beat(2, state=k)], {"is_failsafe": k >= 5}) for k in range(9)),
+    (("ardupilot",), [Event(ARMED_BY)], {"armed": False}),
+    (("ardupilot",), [Event(FAILSAFE_HOLD)], {"is_failsafe": False}),
+    (BOTH, [], {"is_landed": None, "is_position_valid": None, "battery_problem": None}),
+    *(
+        (BOTH, [LandedState(state)], {"is_landed": is_landed})
+        for state, is_landed in enumerate((None, True, False, False, False))
+    ),
+    *(
+        (BOTH, [system], {"battery_problem": problem})
+        for system, problem in (
+            (battery(1, 1, 80), None),
+            (battery(1, 0, 80), because(Code.BATTERY)),
+            (battery(0, 0, 80), None),  # no battery monitor
+            (battery(0, 0, -1), None),
+            (battery(1, 1, 15), None),
+            (battery(1, 1, 14), because(Code.BATTERY_BELOW, percent=14, limit=15)),
+        )
+    ),
+    *(
+        (
+            BOTH,
+            [EstimatorFlags(flags), NED],
+            {"is_position_valid": is_valid, "position_ned_m": POSITION if is_valid else None},
+        )
+        for flags, is_valid in (
+            (GOOD_FLAGS, True),
+            (PX4_WITHOUT_GPS, False),
+            (dialect.ESTIMATOR_POS_HORIZ_REL, True),
+            (dialect.ESTIMATOR_POS_HORIZ_ABS | CONSTANT, True),
+            (CONSTANT, False),
+            (PX4_ON_GROUND, True),
+            (0, False),
+        )
+    ),
+    (("ardupilot",), [NED], {"position_ned_m": POSITION}),  # which it sends with an estimate alone
+    (("px4",), [NED], {"position_ned_m": None}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "told", "expected"),
+    [(autopilot, told, expected) for each, told, expected in TOLD for autopilot in each],
+)
+def test_the_status_is_what_the_vehicle_tells(
+    autopilot: str, told: list[Body], expected: dict[str, Any]
+) -> None:
+    session = Session(autopilot, min_battery_percent=15.0)
+    for body in told:
+        session.put(body)
+    assert {name: getattr(session.status, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("body", "field", "after_ms"),
+    [
+        (LandedState(1), "is_landed", 2000),
+        (battery(1, 0, 80), "battery_problem", 2000),
+        (NED, "position_ned_m", 500),
+    ],
+)
+def test_nothing_that_it_tells_holds_for_ever(body: Body, field: str, after_ms: int) -> None:
+    session = Session()
+    session.put(body)
+    session.now_ns += after_ms * MS
+    assert getattr(session.status, field) is not None
+    session.now_ns += MS
+    assert getattr(session.status, field) is None
+
+
+# --- PX4: CURRENT_MODE and EVENT are faster than HEARTBEAT
 
 
 @pytest.mark.parametrize(
@@ -238,75 +274,10 @@ def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
         assert " ".join(filter(None, told)) == expected
 
 
-def test_px4s_events_mean_nothing_to_ardupilot() -> None:
-    session = Session()
-    for event in (ARMED_BY, FAILSAFE_HOLD):
-        session.put(Event(event))
-    assert (session.status.armed, session.status.is_failsafe) == (False, False)
-
-
-def test_px4s_events_without_a_text_are_shown_and_its_long_texts_put_together() -> None:
+def test_px4s_events_without_a_text_are_shown() -> None:
     session = Session("px4")
     session.put(Event(0x155CD44))
-    for sequence, piece in enumerate(("RTL: start return at 495 m (5 m above destination)", "\t")):
-        session.put(StatusText(piece, 5, sequence, is_full=len(piece) == 50))
-    assert session.texts[-2:] == [
-        "vehicle: manual control lost",
-        "vehicle: RTL: start return at 495 m (5 m above destination)",
-    ]
-
-
-def test_a_receiver_that_px4_does_not_listen_to_is_none() -> None:
-    session = Session("px4", is_ready=False)
-    session.params = {"COM_RC_IN_MODE": 3.0}
-    session.rc(RECEIVER)
-    session.put(SystemStatus(RC_BIT, RC_BIT, -1))
-    session.shake_hands()
-    assert session.status.has_receiver is True
-    session.put(ParamValue("COM_RC_IN_MODE", 1.0))
-    session.now_ns += MS
-    assert session.status.has_receiver is False
-
-
-# --- position
-
-PX4_ON_GROUND = 0x3FF
-"""With GPS, CONST_POS_MODE among them; in the air 0x37F."""
-
-
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-@pytest.mark.parametrize(
-    ("flags", "is_valid"),
-    [
-        (GOOD_FLAGS, True),
-        (PX4_WITHOUT_GPS, False),
-        (dialect.ESTIMATOR_POS_HORIZ_REL, True),
-        (dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_CONST_POS_MODE, True),
-        (dialect.ESTIMATOR_CONST_POS_MODE, False),
-        (PX4_ON_GROUND, True),
-        (0, False),
-    ],
-)
-def test_a_position_counts_if_the_estimator_says_so(
-    autopilot: str, flags: int, is_valid: bool
-) -> None:
-    session = Session(autopilot)
-    session.put(EstimatorFlags(flags))
-    session.put(NED)
-    assert session.status.is_position_valid is is_valid
-    session.now_ns += 500 * MS
-    assert session.status.position_ned_m == ((1.0, 2.0, -3.0) if is_valid else None)
-    session.now_ns += MS
-    assert session.status.position_ned_m is None
-
-
-def test_without_flags_only_ardupilots_position_counts() -> None:
-    """ArduPilot sends none without an estimate; PX4 does."""
-    for autopilot, expected in (("ardupilot", (1.0, 2.0, -3.0)), ("px4", None)):
-        session = Session(autopilot)
-        session.put(NED)
-        assert session.status.is_position_valid is None
-        assert session.status.position_ned_m == expected
+    assert session.texts[-1] == "vehicle: manual control lost"
 
 
 # --- the receiver
@@ -344,13 +315,18 @@ def test_a_receiver_is_learnt_before_the_first_override(
     assert session.status.has_receiver is expected
 
 
-def test_px4_without_rc_channels_has_no_receiver() -> None:
+def test_px4_has_a_receiver_once_it_shows_one_that_it_listens_to() -> None:
     session = Session("px4", is_ready=False)
+    session.params = {"COM_RC_IN_MODE": 3.0}
     assert session.status.has_receiver is None
     session.shake_hands()
     assert session.status.has_receiver is False
     session.rc(RECEIVER)
+    session.put(SystemStatus(RC_BIT, RC_BIT, -1))
     assert session.status.has_receiver is True
+    session.put(ParamValue("COM_RC_IN_MODE", 1.0))
+    session.now_ns += MS
+    assert session.status.has_receiver is False
 
 
 def test_nothing_is_ready_before_the_receiver_was_looked_for() -> None:
@@ -475,8 +451,18 @@ def with_override_switch() -> Session:
     return session
 
 
+# --- reboots
+
+
+def stamped(session: Session, *boot_ms: int) -> bool:
+    """Attitudes with these stamps arrive; True if the vehicle counts as rebooted."""
+    for stamp_ms in boot_ms:
+        session.put(Attitude(True, 1000 * (stamp_ms % 2**32), (1, 0, 0, 0), (0, 0, 0)))
+    return session.session.has_rebooted
+
+
 @given(
-    last_ms=st.one_of(st.integers(50_000, 2**32 - 1), st.integers(2**32 - 5_000, 2**32 - 1)),
+    last_ms=st.integers(50_000, 2**32 - 1) | st.integers(2**32 - 5_000, 2**32 - 1),
     first_ms=st.integers(1_001, 40_000),
     pace=st.floats(0.1, 10.0),
 )
@@ -485,21 +471,18 @@ def test_a_reboot_is_found_wherever_the_clock_stood(
 ) -> None:
     """No vehicle sends its attitude within a second of its boot; a simulator may run faster."""
     session = Session()
-    session.put(Attitude(True, 1000 * last_ms, (1, 0, 0, 0), (0, 0, 0)))
+    stamped(session, last_ms)
     session.now_ns += round(first_ms * NS_PER_MS / pace)
-    for boot_ms in (first_ms, first_ms + 10):
-        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
-    assert session.session.has_rebooted is (last_ms - first_ms > 1000)
+    assert stamped(session, first_ms, first_ms + 10) is (last_ms - first_ms > 1000)
 
 
 def test_one_late_attitude_ends_nothing_and_a_clock_that_was_set_back_does() -> None:
     session = Session()
-    for boot_ms, is_upset in ((60_000, False), (58_800, False), (60_010, False), (55_000, False),
-                              (55_010, True)):  # fmt: skip
-        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
+    for boot_ms in (60_000, 58_800, 60_010, 55_000, 55_010):
+        stamped(session, boot_ms)
         problem = session.session.problem(session.now_ns)
         is_told = problem is not None and problem.code is Code.CLOCK_SET_BACK
-        assert is_told is is_upset
+        assert is_told is (boot_ms == 55_010)
         session.now_ns += 10 * NS_PER_MS
 
 
@@ -513,11 +496,9 @@ def test_a_vehicle_that_has_run_for_longer_than_it_was_silent_has_not_rebooted(
 ) -> None:
     """Its clock was set: what it does by its old sticks is still the flight's."""
     session, boot_ms = Session(), last_ms - back_ms % (last_ms - 2_100)
-    session.put(Attitude(True, 1000 * last_ms, (1, 0, 0, 0), (0, 0, 0)))
+    stamped(session, last_ms)
     session.now_ns += gap_ms * NS_PER_MS
-    for later_ms in range(0, 50, 10):
-        session.put(Attitude(True, 1000 * (boot_ms + later_ms), (1, 0, 0, 0), (0, 0, 0)))
-        assert not session.session.has_rebooted
+    assert not any(stamped(session, boot_ms + later_ms) for later_ms in range(0, 50, 10))
 
 
 @given(
@@ -528,8 +509,7 @@ def test_a_clock_that_wraps_has_not_rebooted(start_ms: int, steps_ms: list[int])
     session, clock_ms = Session(), start_ms
     for step_ms in steps_ms:
         clock_ms = max(clock_ms + step_ms, start_ms)
-        session.put(Attitude(True, 1000 * (clock_ms % 2**32), (1, 0, 0, 0), (0, 0, 0)))
-        assert not session.session.has_rebooted
+        assert not stamped(session, clock_ms)
 
 
 def test_pieces_make_a_text_and_a_lost_one_is_waited_for_and_then_shows() -> None:
