@@ -1,7 +1,7 @@
 """Vehicles whose sticks are mapped in tests, and their motion by independent formulas."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from mavbridge.core.vehicle import StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
@@ -25,17 +25,13 @@ PX4_DEFAULTS = {
 """Parameters of the PX4 whose curves were measured."""
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """Leans in degrees (+ nose down, + right side down), yaw rate in degrees/s, climb in m/s."""
 
     climb_mps: float
     yaw_degps: float
     pitch_deg: float
     roll_deg: float
-
-    def numbers(self) -> tuple[float, float, float, float]:
-        return self.climb_mps, self.yaw_degps, self.pitch_deg, self.roll_deg
 
 
 def policy_motion(sticks: Sticks, gains: StickGains) -> Motion:

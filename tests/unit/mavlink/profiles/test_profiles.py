@@ -3,22 +3,18 @@
 Against the facts measured on ArduCopter 4.7 and PX4 1.18.
 """
 
-import math
 import re
 from collections.abc import Iterable
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.vehicle import ACTION_CLASSES, Output
-from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import NoteKind, ParamContext, ParamNote, Profile
 from mavbridge.mavlink.profiles.px4 import PX4, event_id
 from mavbridge.mavlink.session.vehicle import require_profile
 
-OUTPUTS: tuple[Output, ...] = ("rc-override", "manual-control", "attitude", "rates", "velocity")
 BOTH = pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
 
 
@@ -41,31 +37,23 @@ def test_multirotors_of_two_firmwares_are_flown(vehicle_type: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("vehicle_type", "name"),
-    [(4, "HELICOPTER"), (1, "FIXED_WING"), (10, "GROUND_ROVER"), (22, "VTOL"), (250, "unknown")],
+    ("autopilot", "vehicle_type", "told"),
+    [
+        (3, 4, r"HELICOPTER \(MAV_TYPE 4\).*multirotors"),
+        (12, 1, r"FIXED_WING \(MAV_TYPE 1\).*multirotors"),
+        (3, 10, "GROUND_ROVER"),
+        (12, 22, "VTOL"),
+        (3, 250, "unknown"),
+        (0, 2, r"is GENERIC \(MAV_AUTOPILOT 0\), and only Ardu"),  # Betaflight, INAV
+        (13, 2, "SMACCMPILOT"),
+        (99, 2, "unknown"),
+    ],
 )
-def test_anything_but_a_multirotor_is_refused(vehicle_type: int, name: str) -> None:
-    for autopilot in (3, 12):
-        with pytest.raises(PeerError, match=rf"{name}.* \(MAV_TYPE {vehicle_type}\).*multirotors"):
-            require_profile(autopilot, vehicle_type)
-
-
-@pytest.mark.parametrize(
-    ("autopilot", "name"), [(0, "GENERIC"), (13, "SMACCMPILOT"), (4, "OPENPILOT"), (99, "unknown")]
-)
-def test_other_firmware_is_refused(autopilot: int, name: str) -> None:
-    """Betaflight and INAV call themselves generic."""
-    with pytest.raises(PeerError, match=rf"is {name} \(MAV_AUTOPILOT {autopilot}\), and only Ardu"):
-        require_profile(autopilot, 2)
-
-
-@BOTH
-def test_each_kind_of_action_has_an_output_and_what_has_none_says_which(profile: Profile) -> None:
-    assert set(profile.outputs) == set(ACTION_CLASSES)
-    assert not set(profile.outputs.values()) & set(profile.refusals)
-    assert set(profile.outputs.values()) | set(profile.refusals) == set(OUTPUTS)
-    for refusal in profile.refusals.values():
-        assert f"--output {profile.outputs['sticks']}" in refusal
+def test_other_vehicles_and_firmware_are_refused(
+    autopilot: int, vehicle_type: int, told: str
+) -> None:
+    with pytest.raises(PeerError, match=told):
+        require_profile(autopilot, vehicle_type)
 
 
 @BOTH
@@ -96,18 +84,6 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
     for name in ("AUTO", "AUTO.8", "LOITER", "TERMINATION"):
         with pytest.raises(UserError, match=r"AUTO\.LOITER"):
             modes.command(name)
-
-
-@BOTH
-def test_where_each_output_is_shown(profile: Profile) -> None:
-    shown = {output: profile.echo(output).messages for output in profile.outputs.values()}
-    sticks = "RC_CHANNELS" if profile is ARDUPILOT else "MANUAL_CONTROL"
-    assert shown == {
-        profile.outputs["sticks"]: (sticks,),
-        "attitude": ("ATTITUDE_TARGET",),
-        "rates": ("ATTITUDE_TARGET",),
-        "velocity": ("POSITION_TARGET_LOCAL_NED",),
-    }
 
 
 @pytest.mark.parametrize(
@@ -265,13 +241,3 @@ def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
         (danger,) = profile.dangers({name: 3.5}, ParamContext(output, 255, True))
         assert (danger.risk, f"--set {name}=0.5" in danger.cure) == ("long-setpoint", True)
     assert list(profile.dangers({name: 3.5}, ParamContext(sticks, 255, True))) == []
-
-
-def test_a_takeoff_is_asked_for_by_height_above_home_or_above_the_sea() -> None:
-    command = CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, 8.0))
-    assert ARDUPILOT.takeoff(8.0, None) == ARDUPILOT.takeoff(8.0, 489.0) == command
-    command = PX4.takeoff(5.0, 489.4)
-    assert command.command == dialect.MAV_CMD_NAV_TAKEOFF
-    assert command.params[6] == pytest.approx(494.4)
-    assert all(math.isnan(command.params[k]) for k in (3, 4, 5))  # looking as now, here
-    assert PX4.takeoff(5.0, None) is None

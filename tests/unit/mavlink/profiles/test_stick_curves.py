@@ -7,7 +7,6 @@ import pytest
 
 from helpers.stick_curves import PX4_DEFAULTS, copter_motion, copter_values, policy_motion
 from mavbridge.core.vehicle import NEUTRAL, StickGains, Sticks
-from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves, calibration
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
@@ -74,10 +73,10 @@ def test_other_gains_give_the_motion_of_the_training(conditions: Conditions) -> 
         Sticks(throttle=-0.5, yaw=-0.4, pitch=-0.3, roll=0.2),
         Sticks(throttle=0.19, yaw=0.03, pitch=0.03, roll=-0.03),
     ):
-        moved = copter_motion(curves.to_vehicle(sticks), conditions).numbers()
+        moved = copter_motion(curves.to_vehicle(sticks), conditions)
         # A microsecond of PWM is up to 1 degree/s, 0.14 degrees and 0.014 m/s.
         for got, meant, error in zip(
-            moved, policy_motion(sticks, GAINS).numbers(), (0.02, 1.0, 0.2, 0.2), strict=True
+            moved, policy_motion(sticks, GAINS), (0.02, 1.0, 0.2, 0.2), strict=True
         ):
             assert got == pytest.approx(meant, abs=error)
         assert curves.saturated(sticks) == ()
@@ -98,18 +97,6 @@ def test_what_the_vehicle_cannot_do_is_said_at_once_and_named_stick_by_stick() -
     moved = curves.to_vehicle(both)
     assert moved.pitch == moved.roll == pytest.approx(0.04 + 0.96 * 0.5**0.5)
     assert ardupilot_curves(values_of(TWICE), "ALT_HOLD", GAINS).notes == ()
-
-
-def test_the_profile_has_read_all_that_the_curves_need() -> None:
-    values = values_of(TWICE)
-    first = {name: values[name] for name in ARDUPILOT.params if name in values}
-    read = first | {n: values[n] for n in ARDUPILOT.needed_params(first) if n in values}
-    curves = ARDUPILOT.stick_curves(read, "ALT_HOLD", GAINS)
-    assert curves == ardupilot_curves(values, "ALT_HOLD", GAINS)
-    assert not curves.is_identity
-    values = PX4_DEFAULTS | {"MPC_YAW_EXPO": 0.3, "MPC_Z_MAN_EXPO": 0.4}
-    assert set(values) <= set(PX4.params)
-    assert not PX4.stick_curves(values, "ALTCTL", GAINS).is_identity
 
 
 def test_the_newer_names_and_units_mean_the_same() -> None:
