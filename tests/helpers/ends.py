@@ -4,7 +4,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 
 class Ends:
@@ -47,3 +47,9 @@ class Ends:
         self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), link)
         acks = [m for m in self.run(0.01, link=link) if m.get_type() == "COMMAND_ACK"]
         return acks[-1].result if acks else None
+
+
+def px4_ends(links=1, **changes):
+    """Far ends of a PX4 that is ready at once; ``changes`` as in ``VehicleConfig``."""
+    ready = {"receiver_us": None, "estimator_ready_s": 0.0, "position_ready_s": 0.0}
+    return Ends(links, VehicleConfig(autopilot="px4", **ready, **changes))

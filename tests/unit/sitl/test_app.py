@@ -1,22 +1,17 @@
 """The real-time loop on a fake clock, the camera thread, and the command line."""
 
 import json
-import os
 import socket
 import subprocess
 import sys
-import threading
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import filming, fly
-from sitl.camera.fpv import CameraOptions
-from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest
-from sitl.course import make_course
+from sitl.app import fly
+from sitl.clock import NS_PER_MS, NS_PER_S, StopRequest
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
 
@@ -131,21 +126,3 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
             error = capsys.readouterr().err
             assert error.startswith("sitl: error: ")
             assert error.count("\n") == 1
-
-
-def test_the_camera_publishes_while_its_context_lasts():
-    name = f"sitl-test-{os.getpid()}"
-    options = CameraOptions(shm_name=name, image_size=32, fps=200.0)
-    course = make_course(7)
-    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=course)
-    clock = Clock()
-    deadline_ns = clock.now_ns() + 10 * NS_PER_S
-    with filming(vehicle, course, options, clock):
-        path = Path("/dev/shm") / name
-        frame_id = 0
-        while frame_id < 3 and clock.now_ns() < deadline_ns:
-            clock.sleep_until_ns(clock.now_ns() + NS_PER_MS)
-            frame_id = int.from_bytes(path.read_bytes()[24:32], "little")
-    assert frame_id >= 3
-    assert not path.exists()
-    assert not any(thread.name == "sitl-camera" for thread in threading.enumerate())

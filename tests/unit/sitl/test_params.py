@@ -1,7 +1,6 @@
 """Parameters of both firmwares: names, order, types, units, and refusal of bad values."""
 
 import math
-import struct
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -57,15 +56,3 @@ def test_release_4_7_speaks_of_metres_and_degrees():
     assert params.set_on_wire("RTL_ALT_M", 20.0)
     assert params["RTL_ALT"] == pytest.approx(2000.0)
     assert not params.set_on_wire("RTL_ALT", 1500.0)
-
-
-def test_an_integer_of_px4_travels_as_its_bytes():
-    def as_float(value):
-        return struct.unpack("<f", struct.pack("<i", value))[0]
-
-    params = Px4Params()
-    assert params.kind("NAV_RCL_ACT") == mav.MAV_PARAM_TYPE_INT32
-    assert params.on_wire("NAV_RCL_ACT") == as_float(2)
-    assert params.set_on_wire("NAV_RCL_ACT", as_float(3))
-    assert params.integer("NAV_RCL_ACT") == 3
-    assert not params.set("NAV_RCL_ACT", 2.0**31)

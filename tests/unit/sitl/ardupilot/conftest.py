@@ -1,5 +1,3 @@
-"""The far ends of an ArduPilot vehicle's links."""
-
 import pytest
 
 from helpers.ends import Ends
@@ -7,10 +5,5 @@ from helpers.ends import Ends
 
 @pytest.fixture
 def station():
+    """The far end of an ArduPilot vehicle's link."""
     return Ends()
-
-
-@pytest.fixture(scope="session")
-def station_of():
-    """Makes a station: ``station_of(links=2, config=VehicleConfig(...))``."""
-    return Ends

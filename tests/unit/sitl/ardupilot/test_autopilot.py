@@ -122,26 +122,3 @@ def test_a_radio_failsafe_on_the_ground_disarms_and_without_a_position_lands(pil
     pilot.silence(1.05)
     assert pilot.ap.armed == lifts_off
     assert pilot.ap.mode is (Mode.LAND if lifts_off else Mode.ALT_HOLD)
-
-
-def test_the_mode_switch_acts_after_its_debounce_and_only_when_it_moves(pilot):
-    pilot.take_off(mode=Mode.LOITER)
-    pilot.ap.rc.set_receiver([1500, 1500, 1500, 1500, 1400])
-    pilot.hold(0.19)
-    assert pilot.ap.mode is Mode.LOITER
-    pilot.hold(0.05)
-    assert pilot.ap.mode is Mode.RTL
-    assert pilot.ap.set_mode(Mode.ALT_HOLD)
-    pilot.ap.rc.set_receiver([1500, 1500, 1500, 1500, 1450])
-    pilot.hold(0.5)
-    assert pilot.ap.mode is Mode.ALT_HOLD
-
-
-def test_a_throttle_below_fs_thr_value_is_a_radio_failsafe_after_three_reads(pilot):
-    pilot.take_off()
-    pilot.hold(0.01, thr=950)
-    assert not pilot.ap.radio_failsafe.active
-    pilot.hold(0.1, thr=950)
-    assert pilot.ap.mode is Mode.RTL
-    pilot.hold(0.2)
-    assert pilot.texts() == ["Radio Failsafe", "Radio Failsafe Cleared"]

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import named
+from helpers.ends import Ends
 from sitl.ardupilot.endpoint import ArduPilotTelemetry
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -23,15 +24,15 @@ def test_only_heartbeats_and_timesync_come_without_a_request(station):
     assert request.ts1 == 10 * NS_PER_S + 1
 
 
-def test_intervals_belong_to_the_link_they_came_on(station_of):
-    station = station_of(links=2)
+def test_intervals_belong_to_the_link_they_came_on():
+    station = Ends(links=2)
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100, link=1)
     assert not named(station.run(0.5, link=0), "ATTITUDE")
     assert len(named(station.run(0.5, link=1), "ATTITUDE")) >= 49
 
 
-def test_texts_go_to_all_links(station_of):
-    station = station_of(links=2)
+def test_texts_go_to_all_links():
+    station = Ends(links=2)
     station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196, link=0)
     (text,) = named(station.run(0.1, link=1), "STATUSTEXT")
     assert text.text == "Arming motors"
@@ -120,20 +121,6 @@ def test_the_gcs_only_option_silences_everybody_else(station):
     for system_id, answers in ((42, 0), (255, 1), (1, 1)):
         station.send(mav.MAVLink_timesync_message(0, 5), system_id=system_id)
         assert len(named(station.run(0.01), "TIMESYNC")) == answers
-
-
-def test_prearm_health_waits_for_the_estimator_but_not_for_the_sticks(station):
-    def healthy():
-        station.send(mav.MAVLink_command_long_message(1, 1, 512, 0, 1, *[0] * 6))
-        status = named(station.run(0.01), "SYS_STATUS")[-1]
-        return bool(status.onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK)
-
-    station.run(1.0)
-    assert not healthy()
-    station.run(2.5)
-    station.send(mav.MAVLink_rc_channels_override_message(1, 1, 1700, 1500, 1700, *[65535] * 5))
-    station.run(0.1)
-    assert healthy()
 
 
 @settings(max_examples=60, deadline=None)

@@ -26,19 +26,6 @@ def airborne(ends):
     return ends
 
 
-def test_a_launched_vehicle_hovers_in_altctl_until_sticks_come_and_misses_them(airborne):
-    airborne.run(3.0)
-    assert (airborne.ap.mode_name, airborne.ap.armed, airborne.ap.landed) == (
-        "ALTCTL", True, False,
-    )  # fmt: skip
-    assert airborne.ap.truth.position_ned_m == pytest.approx((0, 0, -10.0), abs=0.3)
-    assert not airborne.ap.in_failsafe
-    airborne.run(0.5, {0: MID})
-    airborne.run(0.9)
-    assert airborne.ap.mode is Px4Mode.AUTO_LOITER
-    assert airborne.ap.in_failsafe
-
-
 def test_a_launch_under_sticks_leaves_them(ends):
     """Otherwise the vehicle would report sticks that were never sent."""
     ends.run(0.2, {0: (0, 300, 500, 0)})

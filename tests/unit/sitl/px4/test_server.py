@@ -1,17 +1,14 @@
 """PX4's links: forwarding, texts and events, hand-packed messages."""
 
-import struct
-
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import named
-from sitl.px4.commander import Event
-from sitl.px4.endpoint import event_message
+from helpers.ends import px4_ends
 
 
-def test_sticks_of_one_link_arrive_on_the_other_like_an_echo(ends_of):
-    ends = ends_of(links=2)
+def test_sticks_of_one_link_arrive_on_the_other_like_an_echo():
+    ends = px4_ends(links=2)
     echoes = named(ends.run(0.1, {0: (111, 0, 500, 0)}, link=1), "MANUAL_CONTROL")
     assert echoes[-1].x == 111
     assert (echoes[-1].get_srcSystem(), echoes[-1].get_srcComponent()) == (255, 190)
@@ -20,8 +17,8 @@ def test_sticks_of_one_link_arrive_on_the_other_like_an_echo(ends_of):
 @pytest.mark.parametrize(
     ("target", "arrives"), [((0, 0), True), ((42, 191), True), ((1, 1), False)]
 )
-def test_a_message_that_is_not_for_the_vehicle_alone_is_passed_on(ends_of, target, arrives):
-    ends = ends_of(links=2)
+def test_a_message_that_is_not_for_the_vehicle_alone_is_passed_on(target, arrives):
+    ends = px4_ends(links=2)
     ends.send(mav.MAVLink_param_request_list_message(*target), link=0)
     assert bool(named(ends.run(0.02, link=1), "PARAM_REQUEST_LIST")) == arrives
 
@@ -29,27 +26,15 @@ def test_a_message_that_is_not_for_the_vehicle_alone_is_passed_on(ends_of, targe
 @pytest.mark.parametrize(
     ("kind", "arrives"), [(mav.MAV_TYPE_GCS, True), (mav.MAV_TYPE_ONBOARD_CONTROLLER, False)]
 )
-def test_heartbeats_of_ground_stations_are_passed_on(ends_of, kind, arrives):
-    ends = ends_of(links=2)
+def test_heartbeats_of_ground_stations_are_passed_on(kind, arrives):
+    ends = px4_ends(links=2)
     ends.send(mav.MAVLink_heartbeat_message(kind, 8, 0, 0, 0, 3), system_id=42)
     heard = [m for m in named(ends.run(0.02, link=1), "HEARTBEAT") if m.get_srcSystem() == 42]
     assert bool(heard) == arrives
 
 
-def test_an_event_has_the_number_and_layout_of_the_firmware():
-    event = Event("commander_armed_by", 79_300)
-    sender = mav.MAVLink(None, srcSystem=1, srcComponent=1)
-    frame = event_message(event, 0x53).pack(sender)
-    assert event.number == 0x0190CAF3
-    # As captured from PX4, without the argument, trailing zeros cut.
-    assert frame[10:-2].hex() == "f3ca9001c43501005300000066"
-    checksum = mav.x25crc(frame[1:-2])
-    checksum.accumulate(bytes([160]))
-    assert struct.unpack("<H", frame[-2:]) == (checksum.crc,)
-
-
-def test_a_ground_stations_link_gets_no_imu_and_a_companions_does(ends_of):
-    ends = ends_of(links=2, onboard_links=frozenset({1}))
+def test_a_ground_stations_link_gets_no_imu_and_a_companions_does():
+    ends = px4_ends(links=2, onboard_links=frozenset({1}))
     assert not named(ends.run(1.0, link=0), "HIGHRES_IMU")
     messages = ends.run(1.0, link=1)  # and those of the second before
     assert len(named(messages, "HIGHRES_IMU")) == pytest.approx(100, abs=2)
@@ -65,28 +50,8 @@ def test_interval_zero_restores_the_default_of_the_link(ends):
     assert default_us == 20_000
 
 
-def test_without_a_position_its_message_goes_on(ends):
-    ends.ap.position_lost = True
-    messages = ends.run(1.5)
-    assert named(messages, "LOCAL_POSITION_NED")
-    assert not named(messages, "GLOBAL_POSITION_INT")
-    assert named(messages, "ESTIMATOR_STATUS")[-1].flags == 0xE5
-
-
 @pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [float("nan"), 0, 0, 0]])
 def test_an_attitude_that_is_none_is_refused(ends, quaternion):
     ends.send(mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, quaternion, 0, 0, 0, 0.5))
     assert ends.ap.setpoint is None
     assert ends.vehicle.log.refused_messages == 1
-
-
-def test_a_long_text_comes_in_numbered_chunks(ends):
-    ends.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))
-    ends.command(mav.MAV_CMD_DO_SET_MODE, 1, 2)
-    arm = mav.MAV_CMD_COMPONENT_ARM_DISARM
-    ends.send(mav.MAVLink_command_long_message(1, 1, arm, 0, 1, *[0] * 6))
-    texts = named(ends.run(0.1), "STATUSTEXT")
-    assert [(text.id, text.chunk_seq) for text in texts] == [(1, 0), (1, 1)]
-    assert "".join(text.text for text in texts) == (
-        "Arming denied: Resolve system health failures first\t"
-    )

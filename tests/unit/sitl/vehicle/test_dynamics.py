@@ -3,10 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from sitl.vehicle import rotation
 from sitl.vehicle.dynamics import GRAVITY_MPS2, QUAD, Quadrotor
 
 STEPS_PER_S = 1_000_000_000 // QUAD.step_ns
@@ -44,13 +41,3 @@ def test_motor_order_and_signs(commands, axis, sign):
     rates = fly(commands, 0.1, state=flying, quad=quad).body.rate_body_radps
     assert sign * rates[axis] > 0.05
     assert all(abs(rate) < 1e-3 for other, rate in enumerate(rates) if other != axis)
-
-
-angle = st.floats(-3.1, 3.1)
-pitch = st.floats(-1.5, 1.5)
-
-
-@given(roll=angle, pitch=pitch, yaw=angle)
-def test_euler_angles_survive_the_quaternion(roll, pitch, yaw):
-    again = rotation.to_euler(rotation.from_euler(roll, pitch, yaw))
-    assert again == pytest.approx((roll, pitch, yaw), abs=1e-6)

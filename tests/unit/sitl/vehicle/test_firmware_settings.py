@@ -43,14 +43,6 @@ def roll_deg(body):
     return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
 
 
-@pytest.mark.parametrize("angle_max_cdeg", [3000, 4500])
-def test_the_lean_of_a_stick_is_its_share_of_angle_max(angle_max_cdeg):
-    body = hold(
-        CENTRED._replace(roll=0.4), angle_max_cdeg=angle_max_cdeg, rc_dead_zones_us=(0,) * 4
-    )
-    assert roll_deg(body) == pytest.approx(0.4 * angle_max_cdeg / 100, rel=0.02)
-
-
 @pytest.mark.parametrize(
     "slower",
     [{"input_time_s": 0.3}, {"lean_rate_max_degps": 40.0}, {"lean_accel_max_cdegps2": 30_000.0}],
