@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from random import Random
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -30,6 +31,18 @@ def failure(problem: object, datagrams: Iterable[bytes]) -> FuzzError:
     return FuzzError(f"{problem}\nby one of these datagrams (hex):\n{lines}")
 
 
+@contextmanager
+def judging(data: bytes) -> Iterator[None]:
+    """What is done with a datagram: any exception, or too long a time, is a failure."""
+    start_s = time.thread_time()
+    try:
+        yield
+    except Exception as error:
+        raise failure(f"{type(error).__name__}: {error}", [data]) from error
+    if time.thread_time() - start_s > MOST_CPU_S:
+        raise failure(f"takes longer than {MOST_CPU_S} s", [data])
+
+
 def fuzz_codec(seed: int, count: int) -> None:
     """Feed ``count`` datagrams.
 
@@ -45,17 +58,12 @@ def fuzz_codec(seed: int, count: int) -> None:
         if number % _SAMPLE_EVERY == 0:
             source.heard.append(sample(vehicle, draw))
         data = source.own() if draw.random() < 0.7 else source.foreign()
-        start_s = time.thread_time()
-        try:
+        with judging(data):
             for message in datagrams.decode_datagram(data):
                 _judge(message)
             for piece in _pieces(data[:4096], draw):
                 for message in stream.decode(piece):
                     _judge(message)
-        except Exception as error:
-            raise failure(f"{type(error).__name__}: {error}", [data]) from error
-        if time.thread_time() - start_s > MOST_CPU_S:
-            raise failure(f"takes longer than {MOST_CPU_S} s", [data])
     for codec in (datagrams, stream):
         assert len(codec._partial) < 300, "the unfinished packet grows"
 
