@@ -84,7 +84,7 @@ def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]
     for text in texts:
         if (match := re.fullmatch(r"([a-z]+)\.([\w-]+)=(.*)", text)) is None:
             raise UserError(
-                f"--set-config {text} is not understood: use SECTION.KEY=VALUE, such as "
+                f"--set-config {text} is not understood: use SECTION.NAME=VALUE, such as "
                 "limits.attitude_age=0.2 (see --print-config)"
             )
         section, key = document.setdefault(match[1], {}), match[2].replace("-", "_")

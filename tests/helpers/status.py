@@ -3,6 +3,8 @@
 import pytest
 
 from mavbridge.__main__ import main
+from mavbridge.cli import cli
+from mavbridge.config.flight import FlyConfig
 
 
 def status_of(*arguments: object) -> int:
@@ -11,3 +13,13 @@ def status_of(*arguments: object) -> int:
         main([str(argument) for argument in arguments])
     assert isinstance(stopped.value.code, int)
     return stopped.value.code
+
+
+def asked_flight(*words: object) -> FlyConfig:
+    """The configuration of the flight that these words ask for, which is not flown."""
+    asked: list[FlyConfig] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "config", cli.config)  # --config sets it, for all who parse later
+        patch.setattr("mavbridge.flight.app.fly", lambda config: asked.append(config) or 0)
+        assert status_of(*words) == 0
+    return asked[0]

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
-from mavbridge.__main__ import main
+from helpers.status import asked_flight, status_of
 from mavbridge.cli import cli
 from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay import replay
-from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError
 from mavbridge.recording.folder import SETTINGS
@@ -188,9 +187,7 @@ def test_a_settings_file_reaches_nothing_by_itself(
     monkeypatch.setattr(cli, "config", cli.config)
     path = lure / "mavbridge.toml"
     path.write_text(text)
-    with pytest.raises(SystemExit) as ended:
-        main(["--config", str(path), "--set-config", "link.timeout=0.1"])
-    assert ended.value.code == 2
+    assert status_of("--config", path, "--set-config", "link.timeout=0.1") == 2
     shown = " ".join(capsys.readouterr().err.split())
     assert f"{flag} '" in shown
     assert "--trust-config" in shown
@@ -200,20 +197,11 @@ def test_a_settings_file_reaches_nothing_by_itself(
     assert list(untrusted_settings(read_toml(path), [f"{flag}=mine"])) == []
 
 
-def test_a_settings_file_decides_how_to_fly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
     """Also by keys that are named as commands."""
-    sample = read_toml(ROOT / "examples" / "deploy" / "mavbridge.toml")
-    assert list(untrusted_settings(sample, [])) == []
-    flown: list[FlyConfig] = []
-    monkeypatch.setattr(cli, "config", cli.config)
-    monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: flown.append(config) or 0)
     path = tmp_path / "mavbridge.toml"
     path.write_text(f'{TAKEN}contract = "mine.toml"\n')
-    with pytest.raises(SystemExit):
-        main(["--config", str(path)])
-    (config,) = flown
+    config = asked_flight("--config", path)
     assert config.record == Path("flights/today")
     assert config.policy.contract == Path("mine.toml")
 
@@ -224,9 +212,8 @@ def test_a_settings_file_that_is_trusted_may_name_a_program(
     monkeypatch.setattr(cli, "config", cli.config)
     path = tmp_path / "mavbridge.toml"
     path.write_text('policy = "./there_is_none.py:Mine"\ncamera = "none"\n')
-    with pytest.raises(SystemExit) as ended:
-        main(["--config", str(path), "--trust-config", "--connect", "udp:127.0.0.1:15691"])
-    assert ended.value.code == 2
+    words = ("--config", path, "--trust-config", "--connect", "udp:127.0.0.1:15691")
+    assert status_of(*words) == 2
     assert "there is no file there_is_none.py" in " ".join(capsys.readouterr().err.split())
 
 
