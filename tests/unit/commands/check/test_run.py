@@ -11,7 +11,7 @@ from rich.console import Console
 
 from helpers.fakes import FakeClock
 from mavbridge.commands.check.policy import Pace, check_policy
-from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
+from mavbridge.commands.check.rows import CheckRow, as_document, print_check
 from mavbridge.commands.check.run import check
 from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
@@ -32,9 +32,9 @@ REFUSED = CheckRow(
 GO = CheckRow(area="link", name="attitude", found="100.0 Hz", expected="100 Hz")
 
 
-def flight(policy: str, camera: CameraConfig = BLIND) -> FlyConfig:
+def flight(policy: str) -> FlyConfig:
     link = LinkConfig(connect=f"udp:127.0.0.1:{free_port()}", connect_timeout=0.1)
-    return FlyConfig(link=link, policy=PolicyConfig(policy=policy), camera=camera)
+    return FlyConfig(link=link, policy=PolicyConfig(policy=policy), camera=BLIND)
 
 
 def test_no_vehicle_is_a_no_go_in_status_table_and_json(
@@ -57,17 +57,6 @@ def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str])
     assert rows["policy"]["verdict"] == "no-go", "a policy that cannot be loaded is a row"
 
 
-def test_a_policy_and_a_computer_are_checked_without_a_vehicle(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    config = FlyConfig(
-        link=LinkConfig(connect="none"), policy=PolicyConfig(policy="scripted:hover"), camera=BLIND
-    )
-    assert check(CheckConfig(timing=0.5, flight=config, json=Path("-"))) == ExitCode.DONE
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert {row["area"] for row in rows} == {"link", "policy", "computer"}
-
-
 @pytest.mark.parametrize(
     ("each_ms", "rate_hz", "late", "verdict"),
     [(4, 100.0, 0, "go"), (9, 100.0, 0, "warn"), (20, 50.0, 49, "warn")],
@@ -86,13 +75,6 @@ def test_a_pace_that_is_not_held_is_a_warning(
     )
     assert pace.rate_hz == pytest.approx(rate_hz)
     assert (pace.late, pace.row().verdict) == (late, verdict)
-
-
-def test_the_worst_row_is_the_verdict() -> None:
-    assert overall([GO]) == "go"
-    assert overall([GO, CheckRow(area="link", name="loss", found="3%", warn="lossy")]) == "warn"
-    assert overall([GO, REFUSED]) == "no-go"
-    assert as_document([REFUSED])["rows"][0]["commands"] == ["--set RC_OVERRIDE_TIME=0.5"]
 
 
 @pytest.mark.parametrize("width", [80, 160])

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.factories import make_released_tick, make_state, make_tick, make_vision_tick
+from helpers.factories import (
+    make_plan,
+    make_released_tick,
+    make_state,
+    make_tick,
+    make_vision_tick,
+)
 from helpers.fakes import FakeClock
 from mavbridge.commands.check import computer
 from mavbridge.commands.check.computer import hottest_c, read_usage, this_computer
@@ -19,38 +25,27 @@ from mavbridge.commands.check.soak import (
     climb_config,
     level_climb,
 )
-from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, because
-from mavbridge.flight.plan import plan_flight
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
 RATES = Contract(action="rates", cameras=("left", "right"), feature_dim=2)
 
 
-def make_runner(calls: list[int], contract: Contract = RATES) -> PolicyRunner:
+def make_runner(calls: list[int]) -> PolicyRunner:
     def act(*arguments: object) -> np.ndarray:
         calls.append(len(arguments))
         return np.ones((1, 16, 4), np.float32)
 
-    return PolicyRunner(
-        contract=contract,
-        name="mine",
-        engine="numpy",
-        dual_rate=True,
-        encode=lambda rgb: rgb,
-        act=act,
-    )
+    names = {"name": "mine", "engine": "numpy"}
+    return PolicyRunner(**names, contract=RATES, dual_rate=True, encode=lambda rgb: rgb, act=act)
 
 
 def make_meter(clock: FakeClock) -> FlightMeter:
-    runner = make_runner([])
-    plan = plan_flight(FlyConfig(), Contract(), is_dual=True)
-    return FlightMeter(plan, runner, clock=clock, guard_pid=os.getpid())
+    return FlightMeter(make_plan(), make_runner([]), clock=clock, guard_pid=os.getpid())
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
@@ -71,8 +66,7 @@ def test_every_camera_of_a_policy_gets_the_vehicles_images() -> None:
 
 
 def test_a_flight_is_measured_from_its_first_action_on() -> None:
-    clock = FakeClock()
-    meter = make_meter(clock)
+    meter = make_meter(FakeClock())
     for index in range(50):
         meter.emit(make_released_tick(index))
         meter.emit(make_vision_tick(index))
@@ -120,11 +114,6 @@ def test_figures_are_those_between_two_readings_a_second_apart() -> None:
     slow = replace(soak.timing.action, rate_hz=90.0)
     row = replace(soak, timing=replace(soak.timing, action=slow)).row()
     assert "does not hold the rate of chunks" in row.warn
-
-
-def test_a_soak_needs_a_policy() -> None:
-    with pytest.raises(UserError, match="--soak needs a policy"):
-        CheckConfig(flight=FlyConfig(policy=PolicyConfig(policy="none")), soak=60)
 
 
 def test_figures_of_the_computer_are_the_kernels(

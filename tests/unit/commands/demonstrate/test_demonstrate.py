@@ -118,27 +118,6 @@ def test_an_interrupted_demonstration_is_unfinished(tmp_path: Path) -> None:
     assert not open_flight(spec.folder).meta.finished
 
 
-def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "000000").mkdir()
-    (tmp_path / "000000" / "thesis.tex").write_text("years of work")
-    with pytest.raises(UserError, match="no recorded flight"):
-        demonstrate(config(tmp_path))
-
-
-def test_no_demonstration_flies_a_held_out_course_and_only_a_student_is_slow(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(UserError, match="seed"):
-        config(tmp_path, seed=100)
-    with pytest.raises(UserError, match="--solve-time"):
-        replace(config(tmp_path), solve_time=100.0)
-
-
-def test_a_named_student_needs_its_checkpoint(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="--policy toge-rates is the student"):
-        replace(config(tmp_path), policy=PolicyConfig(policy="toge-rates"))
-
-
 def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
     plan = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
     assert from_now(plan, 1.5)[0, :, 0].tolist() == [6.0, 10.0, 12.0, 12.0]

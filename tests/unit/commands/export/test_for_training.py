@@ -12,7 +12,6 @@ from helpers.flight_folders import write_meta, write_spot_flight
 from helpers.lerobot_rules import broken_rules
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.run import export, stretches
-from mavbridge.core.errors import UserError
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError
@@ -91,13 +90,3 @@ def test_a_state_in_body_axes_is_what_the_policy_gets_in_flight(tmp_path: Path) 
     np.testing.assert_allclose(mean, flown.mean(axis=0), atol=1e-6)
     with pytest.raises(DatasetError, match=r"observation\.state has shape"):
         read_dataset(out)  # mavbridge train takes the world's axes
-
-
-@pytest.mark.parametrize(
-    ("flag", "value"), [*(("image_size", size) for size in (0, 15, 97, 5000)), ("task", " ")]
-)
-def test_sizes_that_no_video_has_and_a_task_that_says_nothing_are_refused(
-    tmp_path: Path, flag: str, value: object
-) -> None:
-    with pytest.raises(UserError, match=f"--{flag.replace('_', '-')}"):
-        ExportConfig(out=tmp_path, **{flag: value})  # type: ignore[arg-type]

@@ -22,7 +22,6 @@ from policy.training.settings import TrainSettings
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
-OUT = ["flights", "--out", "a.safetensors"]
 
 
 def trained(folder: Path, command: str, *flags: str, seconds: float) -> Path:
@@ -59,45 +58,6 @@ def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[
     model = load_world_model(out)
     assert model.config.image_size == 32
     assert model.config.contract.state_frame == "ned_frd"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["train", "--out", "a.safetensors"], "name the flights"),
-        (["train", "flights"], "--out"),
-        (["train", "flights", "--out", "a.pt"], ".safetensors"),
-        (["train", *OUT, "--policy", "scripted"], "cannot be trained"),
-        (["train", *OUT, "--policy", "toge:huge"], "neither a size"),
-        (["train", "missing", "--out", "a.safetensors"], "no such folder"),
-        (["train", "foreign", "--out", "a.safetensors"], "not a flight of mavbridge"),
-        (["train", *OUT, "--device", "cuda:9"], "not available"),
-        (["train", *OUT, "--ages", "90:40"], "LOW:HIGH"),
-        (["train", *OUT, "--steps", "1", "--minutes", "1"], "contradict"),
-        (["train", "flights", "--out", "no/a.safetensors"], "no folder no"),
-        (["train", *OUT, "--start-from", "b.safetensors"], "no such file"),
-        (["train", *OUT, "--camera-key", "front"], "flights have one camera"),
-        (["train-world-model", *OUT, "--ages", "40:90"], "Unknown option"),
-        (["train-world-model", *OUT, "--start-from", "b.safetensors"], "no such file"),
-        (["train-world-model", *OUT, "--image-size", "40"], "multiple of 16"),
-        (["train", *OUT, "--policy=world-model", "--pack"], "has a command of its own"),
-        (["train-world-model", *OUT], "fly longer"),
-    ],
-)
-def test_bad_input_is_one_message(
-    arguments: list[str],
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_spot_flight(tmp_path / "flights", 0, seconds=0.3)
-    write_meta(tmp_path / "foreign", format="something else")
-    assert status_of(*arguments) in (1, 2)  # ours; the parser's
-    printed = capsys.readouterr()
-    assert says in printed.err + printed.out
-    assert "Traceback" not in printed.err
 
 
 def test_ctrl_c_keeps_the_best_weights_and_says_so(

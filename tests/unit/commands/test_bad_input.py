@@ -1,0 +1,152 @@
+"""What a user can get wrong: one message each, never a traceback, and no file is touched."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from helpers.flight_folders import write_meta, write_spot_flight
+from helpers.recordings import make_meta
+from helpers.rollouts import TINY, TinyWorld, write_flight
+from helpers.status import status_of
+from mavbridge.config.episodes import MAX_EVALUATION_SEED
+from policy.checkpoints.networks import save_world_model
+from policy.checkpoints.tensors import read_tensors, write_tensors
+from policy.contract import Contract
+
+ENU = Contract(state_frame="enu_flu")
+IMAGINE = "imagine --ddim-steps 1 --out a.mp4"
+START = f"{IMAGINE} --start flight --world-model world.safetensors"
+TOGE = (
+    "--decider toge --policy toge:small:resnet18 --set-config network.allow_untrained=true "
+    "--set-config network.image_size=32 --set-config network.engine=torch --num-diffusion-steps 2"
+)
+RECORD = "record --out recorded"
+LISTEN = f"{RECORD} --connect udp:127.0.0.1:14999"
+TRAIN = "train spots --out a.safetensors"
+TRAIN_WORLD = "train-world-model spots --out a.safetensors"
+
+
+def save_broken_world_model(path: Path) -> None:
+    """Weights that are finite, although nothing that they make is."""
+    model = TinyWorld()
+    for weight in model.dynamics.parameters():
+        weight.data.fill_(1e30)
+    save_world_model(path, TinyWorld())
+    header, _ = read_tensors(path)
+    weights = {name: value.contiguous() for name, value in model.state_dict().items()}
+    write_tensors(path, weights, header)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flights, world models, and things that are neither."""
+    folder = tmp_path_factory.mktemp("stock")
+    write_flight(folder / "flight")
+    write_flight(folder / "enu", meta=make_meta(contract=ENU))
+    write_spot_flight(folder / "spots", 0, seconds=0.3)
+    write_meta(folder / "foreign", format="something else")
+    (folder / "empty").mkdir()
+    (folder / "foreigners/000000").mkdir(parents=True)
+    (folder / "foreigners/000000/thesis.tex").write_text("years of work")
+    save_world_model(folder / "world.safetensors", TinyWorld())
+    save_world_model(folder / "enu.safetensors", TinyWorld(replace(TINY, contract=ENU)))
+    save_broken_world_model(folder / "broken.safetensors")
+    (folder / "taken.mp4").write_text("precious")
+    return folder
+
+
+def contents(folder: Path) -> dict[Path, int]:
+    """All files and folders, and when they were changed."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (f"evaluate --seed {MAX_EVALUATION_SEED + 1}", "--seed must be between 0 and"),
+        ("check --connect none --policy none --soak 60", "--soak needs a policy"),
+        ("demonstrate --out new --seed 100", "--seed must be between 0 and"),
+        ("demonstrate --out new --solve-time 100", "give its --checkpoint"),
+        ("demonstrate --out new --policy toge-rates", "toge-rates is the student"),
+        ("demonstrate --out foreigners --episodes 1", "no recorded flight"),
+        ("evaluate --resume", "--resume needs the --json FILE"),
+        ("evaluate --conditions stormy", "--conditions"),
+        ("evaluate --set-config rates.action=0", "between 0.5 and 500 Hz"),
+        ("evaluate --policy toge:medium", "network.allow_untrained"),
+        ("evaluate --policy scripted --json /proc/none/out.json", "cannot write"),
+        ("evaluate --policy scripted --json /", "cannot write --json /"),
+        ("evaluate --policy scripted --ray cluster", "--ray cluster: nothing answers there"),
+        ("export spots --out new --image-size 0", "--image-size"),
+        ("export spots --out new --image-size 97", "--image-size"),
+        ("export spots --out new --image-size 5000", "--image-size"),
+        ("export spots --out new --task ' '", "--task"),
+        ("export-policy --out new --policy scripted", "toge and resnet-unet are exported"),
+        ("export-policy --out new --policy resnet-unet", "needs trained weights"),
+        ("export-policy --out taken.mp4", "is taken"),
+        ("identify --connect udp:127.0.0.1:1 --readonly", "--readonly"),
+        (f"{START} --exe-steps 5 --frames 4", "--exe-steps 5 is more than --frames 4"),
+        (f"{START} --frames 17", "--frames 17 is more than the 16"),
+        (f"{START} --exe-steps 17", "--exe-steps 17 is more than the 16"),
+        ("imagine --start flight --out a.mp4 --ddim-steps 101", "1..100"),
+        (f"{START} --start-at 5", "too short"),
+        (f"{START} --decider toge --policy toge:medium", "--checkpoint"),
+        (f"{START} --checkpoint a.safetensors", "add --decider toge"),
+        (f"{START} --decider pilot", "pilot"),
+        (f"{START} --device cuda:9", "cuda:9 is not available"),
+        (f"{START} --rerun a.txt", ".rrd"),
+        (f"{IMAGINE} --start nowhere", "no folder nowhere"),
+        (f"{IMAGINE} --start empty", "empty is empty"),
+        (f"{IMAGINE} --start foreign", "is not of a recorded flight"),
+        (f"{IMAGINE} --start enu", "states in enu_flu, the world model takes ned_frd"),
+        (f"{IMAGINE} --start enu --world-model enu.safetensors {TOGE}", "enu_flu"),
+        (f"{IMAGINE} --start flight --world-model none.safetensors", "none.safetensors"),
+        (f"{IMAGINE} --start flight --world-model taken.mp4", "taken.mp4"),
+        (f"{IMAGINE} --start flight --world-model broken.safetensors", "NaN or infinity"),
+        ("imagine --start flight --out taken.mp4", "taken.mp4 is there already"),
+        ("imagine --start flight --out a.avi", "must end in .mp4"),
+        ("imagine --start flight --out taken.mp4/a.mp4", "cannot write --out"),
+        ("inspect nowhere --rerun nonsense", "--rerun"),
+        (RECORD, "name the vehicle: --connect"),
+        (f"{RECORD} --connect udp:nowhere", "udp:nowhere"),
+        (f"{LISTEN} --camera none", "nothing to learn from without images"),
+        (f"{LISTEN} --camera nowhere.mp4", "no such file"),
+        (f"{LISTEN} --on-arm --episode-channel 7", "leave one out"),
+        ("train --out a.safetensors", "name the flights"),
+        ("train spots", "--out"),
+        ("train spots --out a.pt", ".safetensors"),
+        ("train spots --out no/a.safetensors", "no folder no"),
+        ("train missing --out a.safetensors", "no such folder"),
+        ("train foreign --out a.safetensors", "not a flight of mavbridge"),
+        (f"{TRAIN} --policy scripted", "cannot be trained"),
+        (f"{TRAIN} --policy toge:huge", "neither a size"),
+        (f"{TRAIN} --device cuda:9", "not available"),
+        (f"{TRAIN} --ages 90:40", "LOW:HIGH"),
+        (f"{TRAIN} --steps 1 --minutes 1", "contradict"),
+        (f"{TRAIN} --start-from b.safetensors", "no such file"),
+        (f"{TRAIN} --camera-key front", "flights have one camera"),
+        (f"{TRAIN} --policy=world-model --pack", "has a command of its own"),
+        (f"{TRAIN_WORLD} --ages 40:90", "Unknown option"),
+        (f"{TRAIN_WORLD} --start-from b.safetensors", "no such file"),
+        (f"{TRAIN_WORLD} --image-size 40", "multiple of 16"),
+        (TRAIN_WORLD, "fly longer"),
+    ],
+)
+def test_bad_input_is_one_message(
+    command: str,
+    told: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    before = contents(folder)
+    assert status_of(*shlex.split(command)) in (1, 2)  # 1: the parser's
+    printed = capsys.readouterr()
+    text = " ".join((printed.out + printed.err).replace("│", " ").split())
+    assert told in text
+    assert "Traceback" not in text
+    after = contents(folder)
+    assert {path: after.get(path) for path in before} == before
+    assert not {"a.mp4", "a.safetensors", "recorded"} & {path.name for path in after}
