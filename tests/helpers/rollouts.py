@@ -101,9 +101,6 @@ def make_plan(**changes: int) -> RolloutPlan:
     return replace(plan, **changes)
 
 
-DECIDERS = ("world-model", "world-model from pixels", "toge")
-
-
 def make_decider(name: str, sampler: Sampler) -> Decider:
     if name == "toge":
         return PolicyDecider(noise_runner(), sampler)

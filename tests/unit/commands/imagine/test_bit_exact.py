@@ -1,4 +1,7 @@
-"""Decoding beside the loop gives the frames of the plain serial path, bit for bit."""
+"""Decoding beside the loop gives the frames of the plain serial path, bit for bit.
+
+No frame is decoded that nobody asked for, and none twice.
+"""
 
 import hashlib
 from pathlib import Path
@@ -7,19 +10,37 @@ import numpy as np
 import pytest
 
 from helpers.rollouts import (
-    DECIDERS,
     SIZE,
+    Finished,
     make_plan,
     make_sampler,
     read_rows,
     run,
     segments,
 )
-from mavbridge.commands.imagine.loop import NoiseStage
+from mavbridge.commands.imagine.loop import NoiseStage, RolloutPlan
 from mavbridge.recording.video.file import count_frames, read_video
 
+THREAD = "mavbridge-rollout-decode"
 
-@pytest.mark.parametrize("decider", DECIDERS)
+OBSERVED = {"world-model": 0, "world-model from pixels": 2, "toge": 1}
+"""Images in the queue of each decider."""
+
+
+def require_needed_decoded(
+    done: Finished, plan: RolloutPlan, decider: str, *, decode_video: bool = True
+) -> None:
+    """What is observed is decoded in the loop, the rest beside it; nobody observes the last."""
+    by_thread = {True: 0, False: 0}
+    for name, count in done.model.decoded:
+        by_thread[name == THREAD] += count
+    needed = min(plan.exe_steps, OBSERVED[decider]) * (plan.iterations - 1)
+    assert by_thread[False] == done.sampler.frames_decoded == needed
+    beside = plan.iterations * plan.frames - needed if decode_video else 0
+    assert by_thread[True] == done.output.frames_decoded == beside
+
+
+@pytest.mark.parametrize("decider", OBSERVED)
 @pytest.mark.parametrize("exe_steps", [1, 5, 16])
 @pytest.mark.usefixtures("in_process_writer")
 def test_frames_are_those_of_a_plain_loop_that_decodes_everything_at_the_end(
@@ -27,6 +48,7 @@ def test_frames_are_those_of_a_plain_loop_that_decodes_everything_at_the_end(
 ) -> None:
     plan = make_plan(exe_steps=exe_steps, seed=exe_steps)
     ours = run(tmp_path / "ours.mp4", plan, decider=decider)
+    require_needed_decoded(ours, plan, decider)
     sampler = make_sampler()
     plain = list(segments(sampler, plan, decider))
     pixels = np.concatenate([sampler.decode(segment.latents) for segment in plain])
@@ -37,6 +59,14 @@ def test_frames_are_those_of_a_plain_loop_that_decodes_everything_at_the_end(
     assert rows["state"].to_pylist() == states.tolist()
     assert rows["action"].to_pylist() == actions.tolist()
     assert ours.output.frames == count_frames(tmp_path / "ours.mp4") == 48
+
+
+@pytest.mark.parametrize("decider", OBSERVED)
+def test_without_a_video_only_observed_frames_are_decoded(tmp_path: Path, decider: str) -> None:
+    plan = make_plan(exe_steps=5)
+    done = run(tmp_path / "a.mp4", plan, decider=decider, decode_video=False)
+    require_needed_decoded(done, plan, decider, decode_video=False)
+    assert not (tmp_path / "a.mp4").exists()
 
 
 @pytest.mark.usefixtures("in_process_writer")

@@ -88,17 +88,3 @@ def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
     # rows of the chunk are 0.05 s apart, steps 0.1 s: their mean is the row between; then held
     np.testing.assert_allclose(actions[:7, 0], chunk[0, 1:15:2, 0], atol=1e-6)
     np.testing.assert_allclose(actions[8:], 0.8, atol=1e-6)
-
-
-def test_a_policy_that_asks_for_the_image_s_age_is_told_that_nothing_moved() -> None:
-    contract = Contract(feature_dim=1, arrays="numpy", since_exposure=True)
-    states = []
-    plain = noise_runner(contract)
-
-    def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        states.append(state)
-        return plain.act(feature, state, history)
-
-    PolicyDecider(replace(plain, act=act), make_sampler()).decide(observe(contract), 0)
-    assert states[0].shape == (1, 20)
-    assert (states[0][0, 13:] == 0).all()
