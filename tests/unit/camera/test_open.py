@@ -10,7 +10,6 @@ from helpers.camera_senders import SIDE, depth_scene, scene
 from helpers.fakes import START_NS
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
-from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.recording.video.file import FragmentedMp4
@@ -109,20 +108,6 @@ def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
     with pytest.raises(UserError, match=r"pip install "):
         check_camera("screen:")
-
-
-@pytest.mark.parametrize(
-    ("settings", "complaint"),
-    [
-        ({"camera_timeout": 0.0}, "link.camera_timeout must be between 0.1 and 3600 s"),
-        ({"camera_latency": -1.0}, "--camera-latency must be between 0 and 2000 ms"),
-        ({"max_frozen_image": -0.1}, "limits.frozen_image must be between 0 and 60 s"),
-        ({"max_black_image": float("nan")}, "limits.black_image must be between 0 and 60 s"),
-    ],
-)
-def test_settings_that_no_camera_has_are_refused(settings, complaint):
-    with pytest.raises(UserError, match=complaint):
-        CameraConfig(**settings)
 
 
 @needs_shm

@@ -2,8 +2,6 @@
 
 import os
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import shared_memory
 from mavbridge.camera.shared_memory import SharedMemoryCamera
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import CameraError
 from sitl.camera.shm import SEQ, FramePublisher
 
@@ -174,40 +172,6 @@ def test_a_file_in_another_format_is_refused(path, clock, content, complaint):
     with pytest.raises(CameraError, match=complaint):
         SharedMemoryCamera(path.name, clock=clock)
     assert "there is none" in SharedMemoryCamera("nobody", clock=clock).waiting_reason
-
-
-SOLID_FRAMES = """
-import sys, time
-import numpy as np
-from sitl.camera.shm import FramePublisher
-publisher = FramePublisher(sys.argv[1], 320, 240)
-print("ready", flush=True)
-sys.stdin.readline()
-for frame_id in range(1, 4001):
-    publisher.publish(np.full((240, 320, 3), frame_id % 251, np.uint8), time.monotonic_ns())
-publisher.close()
-"""
-
-
-@pytest.mark.system
-def test_no_torn_frame_from_a_writer_at_full_speed(path):
-    """Another process publishes as fast as it can; each frame read must be of one colour."""
-    command = [sys.executable, "-c", SOLID_FRAMES, path.name]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as writer:
-        assert writer.stdout.readline() == "ready\n"
-        camera = SharedMemoryCamera(path.name, clock=MonotonicClock())
-        writer.stdin.write("go\n")
-        writer.stdin.flush()
-        frames = []
-        while not frames or frames[-1].frame_id < 4000:
-            frames.append(camera.read(10 * NS_PER_S))
-            level = frames[-1].frame_id % 251
-            assert frames[-1].rgb.min() == frames[-1].rgb.max() == level
-        camera.close()
-    assert writer.returncode == 0
-    assert len(frames) > 1
 
 
 def test_depth_is_read_as_it_was_written(path, clock):

@@ -20,26 +20,19 @@ def speak() -> None:
     logging.getLogger("other.library").warning("trouble")
 
 
+@pytest.mark.parametrize("verbose", [True, False])
 def test_the_file_gets_all_of_ours_and_the_terminal_what_it_has_not_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], verbose: bool
 ) -> None:
     path = tmp_path / "logs" / "run.log"
-    with run_log(path, verbose=True):
+    with run_log(path, verbose=verbose):
         speak()
     text, shown = path.read_text(), capsys.readouterr().err
     for words in ("command: mavbridge", "versions: mavbridge", "FLYING", "a detail", "trouble"):
         assert words in text
     assert ("chatter" in text, "FLYING" in shown, "chatter" in shown) == (False, False, False)
-    assert "a detail\ntrouble\n" in shown
+    assert "a detail\ntrouble\n" in shown if verbose else shown == "trouble\n"
     assert not [t for t in threading.enumerate() if t.name == log.THREAD]
-
-
-def test_without_verbose_the_terminal_shows_warnings_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with run_log(tmp_path / "run.log", verbose=False):
-        speak()
-    assert capsys.readouterr().err == "trouble\n"
 
 
 def test_runs_are_added_with_their_errors_and_the_traceback_of_a_bug(tmp_path: Path) -> None:

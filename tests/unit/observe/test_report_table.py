@@ -22,12 +22,8 @@ def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
     console = Console(file=io.StringIO(), width=100, record=True)
     console.print(table)
     text = console.export_text()
-    rows = {
-        cells[0]: cells[1:]
-        for line in text.splitlines()
-        if line.startswith("│")
-        for cells in [[cell.strip() for cell in line.strip("│").split("│")]]
-    }
+    cells = [line.strip("│").split("│") for line in text.splitlines() if line.startswith("│")]
+    rows = {name.strip(): [value.strip() for value in values] for name, *values in cells}
     for name, value_ms in (
         ("chunk period", "10.00"),
         ("stick lateness", "2.00"),
@@ -43,27 +39,17 @@ def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
 @pytest.mark.parametrize(
     ("link", "expected"),
     [
-        (
-            {"echo_confirmed": False, "lost_fraction": 0.5},
-            "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost",
-        ),
-        (
-            {"echo_confirmed": None, "lost_fraction": None},
-            "echo not checked, loss not measured",
-        ),
-        (
-            {"saturated": (("pitch", 0.123), ("yaw", 0.001))},
-            "echo confirmed, 0.00% of the vehicle's messages lost, pitch beyond what the vehicle "
-            "does in 12.3%, yaw beyond what the vehicle does in 0.1%",
-        ),
+        ({"echo_confirmed": False, "lost_fraction": 0.5}, "NO ECHO from the vehicle, 50.00% of"),
+        ({"echo_confirmed": None, "lost_fraction": None}, "echo not checked, loss not measured"),
+        ({"saturated": (("pitch", 0.123),)}, "lost, pitch beyond what the vehicle does in 12.3%"),
     ],
 )
 def test_the_link_verdict_is_honest(link: dict[str, Any], expected: str) -> None:
     good = {"lost_fraction": 0.0, "echo_confirmed": True}
     stats = LinkStats(messages_per_s=(), rtt_ms=None, sent_overrides=1, **(good | link))
-    assert f"link     1 stick message sent, {expected}" in verdict_lines(
-        report_of(make_tick(), link=stats)
-    )
+    (line,) = (each for each in verdict_lines(report_of(make_tick(), link=stats)) if "link" in each)
+    assert line.startswith("link     1 stick message sent, ")
+    assert expected in line
 
 
 def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:

@@ -3,14 +3,13 @@
 import os
 import resource
 import signal
-import threading
 from collections.abc import Iterator
 from multiprocessing.connection import wait
 from pathlib import Path
 
 import pytest
 
-from helpers.recordings import make_row, picture, send_signal
+from helpers.recordings import make_row, picture
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
@@ -53,15 +52,6 @@ def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWri
 def send(link: PacketPipe, count: int) -> None:
     for k in range(count):
         link.put(Packet(k * 1000, b"%05d" % k))
-
-
-def await_size(path: Path, size_bytes: int) -> None:
-    pause = threading.Event()
-    for _ in range(3_000):
-        if path.exists() and path.stat().st_size >= size_bytes:
-            return
-        pause.wait(0.01)
-    raise TimeoutError
 
 
 def test_everything_is_written_in_order_also_what_came_before_the_thread(
@@ -124,16 +114,3 @@ def test_the_log_goes_on_after_the_recording_was_finished(
     assert wait([video._process.sentinel], DEADLINE_S)
     assert numbers(tmp_path / "link.tlog") == [*range(10), *range(10)]
     assert link.dropped == 0
-
-
-def test_a_killed_writer_costs_the_log_and_not_the_link(
-    tmp_path: Path, video: VideoWriter, link: PacketPipe
-) -> None:
-    send(link, 10)
-    await_size(tmp_path / "link.tlog", 10 * 13)
-    assert video.pid is not None
-    send_signal(video.pid, signal.SIGKILL)
-    send(link, 7)
-    assert link.dropped == 7
-    video.close()
-    assert numbers(tmp_path / "link.tlog") == [*range(10)]

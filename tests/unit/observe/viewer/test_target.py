@@ -44,10 +44,8 @@ def test_an_unknown_target_is_refused_with_the_choices(text: str) -> None:
 @pytest.mark.parametrize(
     "url",
     [
-        "http://127.0.0.1:9876/proxy",
-        "rerun+http://127.0.0.1/proxy",
-        "rerun+http://:9876/proxy",
-        "rerun+http://127.0.0.1:9876",
+        *("http://127.0.0.1:9876/proxy", "rerun+http://127.0.0.1/proxy"),
+        *("rerun+http://:9876/proxy", "rerun+http://127.0.0.1:9876"),
         "rerun+http://127.0.0.1:99999/proxy",
     ],
 )
