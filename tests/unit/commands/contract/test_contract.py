@@ -10,7 +10,7 @@ import pytest
 
 from helpers.status import status_of
 from policy.adapters.interface import read_interface
-from policy.contract import ACTION_NAMES, STATE_NAMES
+from policy.contract import ACTION_NAMES
 from policy.errors import ContractError
 
 CAMERA = "observation.images.front"
@@ -98,17 +98,6 @@ def test_a_draft_with_all_answers_is_read(tmp_path: Path) -> None:
     assert interface.camera_keys == (CAMERA,)
 
 
-def test_a_dataset_says_its_names_and_its_rate(tmp_path: Path) -> None:
-    names = [*STATE_NAMES[:2], "az_mps2"]
-    path = draft(dataset(tmp_path, {"motors": names}, az_mps2=-9.7))
-    interface = read_interface(path)
-    assert interface.contract.chunk_dt_s == 0.05
-    assert interface.contract.state_frame == "ned_frd"
-    assert interface.contract.action == "sticks"
-    assert interface.state_names == tuple(names)
-    assert "# GUESSED: the mean of az_mps2 is -9.7" in path.read_text()
-
-
 def test_names_are_guessed_by_their_spelling_and_marked(tmp_path: Path) -> None:
     path = draft(dataset(tmp_path, ["Vel_X", "vy", "acc_z"], az_mps2=9.8))
     assert tomllib.loads(path.read_text())["state"]["names"] == ["vx_mps", "vy_mps", "az_mps2"]
@@ -143,10 +132,16 @@ def test_cameras_are_called_by_the_ends_of_their_keys_or_numbered(
 def test_the_dataset_that_training_noted_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = dataset(tmp_path / "data", ["vx_mps", "vy_mps", "az_mps2"], az_mps2=-9.0)
+    names = ("vx_mps", "vy_mps", "az_mps2")
+    data = dataset(tmp_path / "data", {"motors": [*names]}, az_mps2=-9.7)
     policy = checkpoint(tmp_path / "policy")
     write_json(policy / "train_config.json", {"dataset": {"root": str(data), "repo_id": "a/b"}})
-    assert read_interface(draft(policy)).contract.chunk_dt_s == 0.05
+    path = draft(policy)
+    interface = read_interface(path)
+    assert interface.contract.chunk_dt_s == 0.05
+    assert (interface.contract.state_frame, interface.contract.action) == ("ned_frd", "sticks")
+    assert interface.state_names == names
+    assert "# GUESSED: the mean of az_mps2 is -9.7" in path.read_text()
     assert f"its dataset is {data}" in capsys.readouterr().out
 
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from helpers.factories import make_tick
+from helpers.fakes import FakeClock
 from helpers.recordings import make_frame, make_meta
 from mavbridge.commands.record import episodes
 from mavbridge.commands.record.episodes import Episodes, disk_left_gb, prepare_out
@@ -16,16 +17,6 @@ from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
 PACKET = bytes(20)
-
-
-class Clock:
-    """Stands still at the first tick."""
-
-    def now_ns(self) -> int:
-        return make_tick(0).woke_ns
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        raise AssertionError("nothing waits")
 
 
 @dataclass
@@ -39,7 +30,7 @@ class Stand:
     def __post_init__(self) -> None:
         self.episodes = Episodes(
             self.out,
-            clock=Clock(),
+            clock=FakeClock(),
             make_meta=lambda begin_ns: make_meta(start_ns=begin_ns, source="pilot"),
             log_to=self._log_to,
             autopilot=lambda: "ardupilot 4.7.0",

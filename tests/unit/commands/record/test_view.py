@@ -2,6 +2,7 @@ import io
 import os
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import pytest
@@ -27,8 +28,6 @@ class Viewed:
     sink: ListSink
     view: PilotView
     end: WireEnd
-    guard: SocketPort
-    """The guard's end of the samples."""
 
     def radio(self, at_ns: int) -> Packets:
         mav = self.end.mav
@@ -53,19 +52,8 @@ class Viewed:
 def viewed() -> Iterator[Viewed]:
     sink = ListSink()
     ours, guards = map(SocketPort, channel_pair())
-    view = PilotView(make_plan(), sink=sink, samples=ours)
-    yield Viewed(sink, view, WireEnd(), guards)
-    ours.close()
-    guards.close()
-
-
-@pytest.fixture
-def pipe() -> Iterator[tuple[int, PacketPipe]]:
-    reader, writer = os.pipe()
-    log = PacketPipe(writer, wall_offset_ns=0)
-    yield reader, log
-    log.close()
-    os.close(reader)
+    with closing(ours), closing(guards):
+        yield Viewed(sink, PilotView(make_plan(), sink=sink, samples=ours), WireEnd())
 
 
 def status(autopilot: str) -> GuardStatus:
@@ -93,54 +81,39 @@ def test_ticks_are_the_pilots_and_old_sticks_are_none(viewed: Viewed) -> None:
     assert viewed.tick(START_NS + STICKS_FRESH_NS + 1).rc_sticks is None
 
 
-def test_packets_are_logged_while_there_is_a_log(
-    viewed: Viewed, pipe: tuple[int, PacketPipe]
-) -> None:
-    reader, log = pipe
+def test_packets_are_logged_while_there_is_a_log(viewed: Viewed) -> None:
+    reader, writer = os.pipe()
     viewed.view.receive(viewed.radio(START_NS))
-    viewed.view.log_to(log)
     radio = viewed.radio(START_NS)
-    viewed.view.receive(radio)
-    viewed.view.log_to(None)
-    viewed.view.receive(viewed.radio(START_NS))
-    logged = os.read(reader, 1 << 16)
-    assert len(logged) == sum(8 + len(packet.data) for packet in radio.packets)
-    assert logged.endswith(radio.packets[-1].data)
+    with closing(PacketPipe(writer, wall_offset_ns=0)) as log:
+        viewed.view.log_to(log)
+        viewed.view.receive(radio)
+        viewed.view.log_to(None)
+        viewed.view.receive(viewed.radio(START_NS))
+    with os.fdopen(reader, "rb") as logged:
+        data = logged.read()
+    assert len(data) == sum(8 + len(packet.data) for packet in radio.packets)
+    assert data.endswith(radio.packets[-1].data)
 
 
-# --- the status line
-
-
-SHOWN = Shown(
-    number=3,
-    duration_ns=None,
-    counts=Counter({True: 2, None: 1}),
-    disk_gb=4.04,
-    stick_packets=0,
-    sticks_ns=0,
-    problem=None,
-)
-
-
-@pytest.fixture
-def screen() -> RecordScreen:
-    return RecordScreen(Console(file=io.StringIO()), rate_hz=100.0, vision_hz=30.0)
-
-
-def test_the_line_tells_state_number_marks_sticks_and_disk(screen: RecordScreen) -> None:
+def test_the_status_line_tells_state_number_marks_sticks_and_disk() -> None:
+    screen = RecordScreen(Console(file=io.StringIO()), rate_hz=100.0, vision_hz=30.0)
     assert "waiting for the vehicle" in screen.status_line().plain
     screen.emit(make_tick(0, rc_sticks=Sticks(0.1, -0.2, 0.3, -1.0)))
-    screen.shown = SHOWN
+    screen.shown = shown = Shown(
+        number=3,
+        duration_ns=None,
+        counts=Counter({True: 2, None: 1}),
+        disk_gb=4.04,
+        stick_packets=0,
+        sticks_ns=0,
+        problem=None,
+    )
     line = screen.status_line().plain
-    for part in (
-        "next: episode 3",
-        "ALT_HOLD armed",
-        "T+0.10 Y-0.20 P+0.30 R-1.00",
-        "disk 4.0 GB",
-        "2 good 0 bad 1 unmarked",
-    ):
+    sticks = "T+0.10 Y-0.20 P+0.30 R-1.00"
+    for part in ("next: episode 3", sticks, "disk 4.0 GB", "2 good 0 bad 1 unmarked"):
         assert part in line
-    screen.shown = replace(SHOWN, duration_ns=12 * NS_PER_S, problem="no sticks of a pilot")
+    screen.shown = replace(shown, duration_ns=12 * NS_PER_S, problem="no sticks of a pilot")
     screen.emit(make_tick(1, rc_sticks=None))
     line = screen.status_line().plain
     assert "RECORDING episode 3  12.0 s" in line
