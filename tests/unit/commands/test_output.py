@@ -5,21 +5,6 @@ import pytest
 
 from mavbridge.commands.output import print_status, require_outputs
 from mavbridge.core.errors import UserError
-from mavbridge.core.files import require_writable
-
-
-def test_a_folder_is_made_for_the_output_and_the_output_is_not(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "a.json"
-    require_writable(path, "--json")
-    assert path.parent.is_dir()
-    assert not path.exists()
-
-
-@pytest.mark.parametrize("name", ["", "file/a.json"])
-def test_what_cannot_be_written_is_refused_with_its_flag(tmp_path: Path, name: str) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(UserError, match=r"cannot write --json .*: "):
-        require_writable(tmp_path / name, "--json")
 
 
 def test_a_figure_without_matplotlib_is_refused(

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_state, make_tick, make_trace
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
@@ -37,34 +37,33 @@ reasons = (
 )
 
 
-@st.composite
-def ticks(draw: st.DrawFn) -> Tick:
-    state = None
-    if draw(st.booleans()):
-        values = np.array(draw(st.lists(floats, min_size=13, max_size=13)), np.float32)
-        state = replace(make_state(draw(stamps)), values=values)
-    return replace(
-        make_tick(draw(st.integers(0, 10**6))),
-        is_slot=draw(st.booleans()),
-        is_coasting=draw(st.booleans()),
-        chunk_serial=draw(st.none() | st.integers(0, 10**6)),
-        chunk_computed_ns=draw(st.none() | stamps),
-        predict_ns=draw(st.none() | stamps),
-        feature_frame_id=draw(st.none() | st.integers(0, 10**6)),
-        feature_captured_ns=draw(st.none() | stamps),
-        state=state,
-        trace=make_trace(draw(sticks)) if draw(st.booleans()) else None,
-        sent=draw(st.none() | sticks),
-        rc_sticks=draw(st.none() | sticks),
-        release_reason=draw(st.none() | reasons),
-        mode=draw(st.none() | st.text()),
-        armed=draw(st.booleans()),
-        rc_channels_us=tuple(draw(st.lists(st.integers(0, 65535), max_size=18))),
-        texts=tuple(draw(st.lists(st.text(), max_size=3))),
-    )
-
-
-tick_rows = st.builds(TickRow, ticks(), st.integers(0, 9), st.none() | sticks)
+states = st.builds(
+    lambda at_ns, values: make_state(at_ns, values=np.array(values, np.float32)),
+    stamps,
+    st.lists(floats, min_size=13, max_size=13),
+)
+numbers = st.integers(0, 10**6)
+ticks = st.builds(
+    make_tick,
+    numbers,
+    is_slot=st.booleans(),
+    is_coasting=st.booleans(),
+    chunk_serial=st.none() | numbers,
+    chunk_computed_ns=st.none() | stamps,
+    predict_ns=st.none() | stamps,
+    feature_frame_id=st.none() | numbers,
+    feature_captured_ns=st.none() | stamps,
+    state=st.none() | states,
+    trace=st.none() | st.builds(make_trace, sticks),
+    sent=st.none() | sticks,
+    rc_sticks=st.none() | sticks,
+    release_reason=st.none() | reasons,
+    mode=st.none() | st.text(),
+    armed=st.booleans(),
+    rc_channels_us=st.lists(st.integers(0, 65535), max_size=18).map(tuple),
+    texts=st.lists(st.text(), max_size=3).map(tuple),
+)
+tick_rows = st.builds(TickRow, ticks, st.integers(0, 9), st.none() | sticks)
 truths = st.builds(
     FrameTruth,
     position_ned_m=vectors,

@@ -1,8 +1,6 @@
 import errno
 import os
 import signal
-import subprocess
-import sys
 import threading
 from contextlib import closing
 from multiprocessing import Pipe
@@ -87,46 +85,6 @@ def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> No
         producer.join(DEADLINE_S)
         assert len(reasons) == 1
         assert "has died" in reasons[0]
-
-
-PRODUCER = """
-import os, signal, sys
-from pathlib import Path
-from mavbridge.recording.video.writer import VideoWriter
-from helpers.recordings import make_row, picture
-
-if __name__ == "__main__":
-    folder = Path(sys.argv[1])
-    video = VideoWriter(folder / "camera.mp4", pressure="offline", hz=30, rows=folder / "frames")
-    print(video.pid, flush=True)
-    for k in range(50):
-        video.submit(picture(k), make_row(k))
-    if sys.argv[2] == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.parametrize("how", ["kill", "forget"])
-def test_without_its_producer_the_writer_finishes_by_itself(tmp_path: Path, how: str) -> None:
-    script = tmp_path / "producer.py"
-    script.write_text(PRODUCER)
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    path = os.pathsep.join([*sys.path])
-    process = subprocess.Popen(
-        [sys.executable, str(script), str(folder), how],
-        stdout=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": path},
-        text=True,
-    )
-    with process:
-        assert process.stdout is not None
-        # The writer has inherited the output: its end is the writer's end.
-        process.stdout.read()
-        status = process.wait(DEADLINE_S)
-    assert status == (-signal.SIGKILL if how == "kill" else 0)
-    assert read_back(folder) == (list(range(50)), list(range(50)))
-    assert (folder / "frames.parquet").exists()
 
 
 class Alive:

@@ -1,4 +1,3 @@
-import json
 import math
 
 import pytest
@@ -10,7 +9,6 @@ from mavbridge.commands.evaluate import (
     mean,
     rate,
     summarise,
-    to_json,
 )
 from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
@@ -42,16 +40,6 @@ def test_the_figures_of_three_flights() -> None:
         "course_s": (7.5, 2),
         "drift_m": None,
     }
-
-
-def test_json_holds_the_summary_and_every_episode() -> None:
-    document = json.loads(to_json(CONFIG, FLOWN, "digest"))
-    assert document["summary"]["success_rate"]["value"] == 0.5
-    assert document["summary"]["outcomes"] == {"finished": 1, "crashed": 1}
-    assert document["asked_episodes"] == 5
-    assert (document["conditions"], document["vision_delay_ms"]) == ("random", 50.0)
-    assert [episode["outcome"] for episode in document["episodes"]] == ["finished", "crashed"]
-    assert document["episodes"][0]["gate_times_s"] == [4.0, 9.0]
 
 
 def test_stick_movement_counts_only_what_the_policy_sent_in_a_row() -> None:
