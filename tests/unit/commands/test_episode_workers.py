@@ -30,12 +30,6 @@ def test_an_error_ends_the_run_with_the_results_before_it() -> None:
         next(flown)
 
 
-def test_where_to_fly() -> None:
-    assert WorkersConfig().ray_address is None
-    assert WorkersConfig(ray=True).ray_address == "auto"
-    assert WorkersConfig(ray="head:6379").ray_address == "head:6379"
-
-
 def test_a_bad_cluster_is_refused_before_ray_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
 

@@ -143,7 +143,7 @@ end_process(5, lambda: print("last words", file=sys.stderr))
 
 
 def test_the_process_ends_with_its_last_words() -> None:
-    """Whether or not anybody reads: tests/unit/observe/test_output.py."""
+    """Also if nobody reads: terminal-stalled in tests/faults/catalogue/host.toml."""
     ended = subprocess.run(
         [sys.executable, "-c", END], capture_output=True, text=True, timeout=60, check=False
     )

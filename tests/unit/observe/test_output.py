@@ -1,16 +1,11 @@
-"""A console that nobody reads holds up neither a flight nor its end."""
+"""A console that nobody reads holds up neither a flight nor its end.
+
+Whole flights of such a console are in tests/faults/catalogue: terminal-stalled, chatty-unread.
+"""
 
 import io
 import os
-import pty
-import select
-import signal
-import subprocess
 import sys
-import termios
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -19,80 +14,6 @@ from helpers.factories import make_tick
 from helpers.reports import report_of
 from mavbridge.observe.output import PatientOutput, stray_lines_shown
 from mavbridge.observe.terminal import FlightScreen
-
-FLIGHT = """
-import logging, sys, threading
-from helpers.factories import make_tick
-from helpers.reports import report_of
-from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.stopping import end_process, stop_on_signals
-from mavbridge.observe.output import flight_console
-from mavbridge.observe.terminal import FlightScreen
-
-screen = FlightScreen(flight_console(), action_hz=100, vision_hz=30, readonly=False)
-with stop_on_signals() as stop:
-    screen.start()
-    index = 0
-    print("flying", file=open(sys.argv[1], "w"))
-    while not stop.wait(0.001):
-        index += 1
-        screen.emit(make_tick(index, texts=("a message of the vehicle " * 40,)))
-        logging.warning("a warning " * 40)
-        sys.stderr.write("stray text " * 40)
-screen.show_report(report_of(make_tick(0)))
-is_read = screen.close(0.3)
-end_process(3 if is_read else 4, lambda: print("error: the end", file=sys.stderr))
-"""
-
-
-@contextmanager
-def stalled_pipe() -> Iterator[int]:
-    reader, writer = os.pipe()
-    yield writer
-    os.close(reader)
-    os.close(writer)
-
-
-@contextmanager
-def stopped_terminal() -> Iterator[int]:
-    master, terminal = pty.openpty()
-    termios.tcflow(terminal, termios.TCOOFF)  # as Ctrl-S does
-    yield terminal
-    os.close(master)
-    os.close(terminal)
-
-
-@pytest.mark.parametrize("console", [stalled_pipe, stopped_terminal])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_flight_of_a_console_that_nobody_reads(
-    console: Callable[[], AbstractContextManager[int]], number: signal.Signals, tmp_path: Path
-) -> None:
-    """Fails with a plain ``Console(stderr=True)``, and with ``sys.exit`` for ``end_process``."""
-    fifo = tmp_path / "flying"
-    os.mkfifo(fifo)
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
-        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)
-    }
-    with console() as stderr:
-        command = [sys.executable, "-c", FLIGHT, str(fifo)]
-        with subprocess.Popen(command, stderr=stderr, env=environment) as flight:
-            assert fifo.read_text() == "flying\n"
-            assert wait_until_full(stderr)
-            flight.send_signal(number)
-            try:
-                assert flight.wait(30.0) == 4
-            finally:
-                flight.kill()
-
-
-def wait_until_full(stderr: int) -> bool:
-    """Whether the console takes nothing more, after 30 s at most."""
-    return any(not select.select([], [stderr], [], 0)[1] or pause() for _ in range(600))
-
-
-def pause() -> bool:
-    select.select([], [], [], 0.05)
-    return False
 
 
 def test_a_reader_who_comes_back_gets_everything() -> None:

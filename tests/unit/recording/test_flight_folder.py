@@ -17,13 +17,11 @@ from helpers.recordings import (
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Tick, VisionTick
-from mavbridge.core.vehicle import Sticks
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
-from mavbridge.recording.rows import FrameTruth
 from policy.contract import Contract
 
 
@@ -68,29 +66,6 @@ def test_a_flight_comes_back(flight: Path) -> None:
     assert sorted(path.name for path in flight.iterdir()) == [
         *("camera.mp4", "frames.parquet", "meta.json", "ticks.parquet")
     ]
-
-
-def test_a_demonstration_has_its_labels(tmp_path: Path) -> None:
-    expert = Sticks(0.25, 0.5, -0.5, 1.0)
-    truth = FrameTruth(
-        position_ned_m=(1.0, 2.0, -3.0),
-        ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-        velocity_ned_mps=(0.5, 0.0, 0.0),
-        next_gate=None,
-        gate_body_m=None,
-        gate_yaw_rad=None,
-        gate_after_body_m=None,
-    )
-    meta = make_meta(source="demonstration", course_seed=7, conditions={"wind_mps": 3.5})
-    writer = FlightWriter(tmp_path, meta, pressure="offline", with_labels=True)
-    writer.tick(make_tick(0), expert)
-    writer.frame(make_frame(0), truth)
-    writer.finish(meta)
-    back = open_flight(tmp_path)
-    assert [row.expert for row in back.tick_rows()] == [expert]
-    assert [row.truth for row in back.frame_rows()] == [truth]
-    assert back.meta.conditions == {"wind_mps": 3.5}
-    assert not (tmp_path / "link.tlog").exists()
 
 
 def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(

@@ -8,7 +8,6 @@ import pytest
 
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
-from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.recorder import Recorder
@@ -49,21 +48,6 @@ class RecorderStand:
     def emit(self, ticks: range, frames: range) -> None:
         for event in (*map(make_tick, ticks), *map(make_frame, frames)):
             self.recorder.emit(event)
-
-
-def test_ticks_frames_and_packets_end_in_the_folder(tmp_path: Path) -> None:
-    with RecorderStand(tmp_path) as stood:
-        for k in range(3):
-            stood.packets.put(Packet(k, b"packet"))
-        stood.emit(range(300), range(20))
-    assert stood.recorder.dropped == 0
-    assert stood.recorder.summary() == f"recorded 300 ticks and 20 frames in {tmp_path}"
-    back = open_flight(tmp_path)
-    assert (back.meta.ticks, back.meta.frames, back.meta.packets_dropped) == (300, 20, 0)
-    assert back.meta.autopilot == "ardupilot 4.6.0"
-    assert [number_of(rgb) for rgb in back.images()] == list(range(20))
-    assert (tmp_path / "link.tlog").stat().st_size == 3 * (8 + 6)
-    assert stood.told == []
 
 
 def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path) -> None:

@@ -42,13 +42,6 @@ def disk_of(limit_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_finishing_leaves_parquet_alone(tmp_path: Path) -> None:
-    write(tmp_path / "frames", [3, 2]).finish()
-    assert [path.name for path in tmp_path.iterdir()] == ["frames.parquet"]
-    assert pq.ParquetFile(tmp_path / "frames.parquet").num_row_groups == 1
-    assert read_table(tmp_path / "frames", FRAMES)["frame_id"].to_pylist() == [0, 1, 2, 3, 4]
-
-
 @settings(max_examples=40)
 @given(st.floats(0, 1))
 def test_a_stream_cut_off_anywhere_has_its_whole_batches(share: float) -> None:
