@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 
-from mavbridge.__main__ import main
 from mavbridge.config.policy import PolicyConfig
 
 
@@ -23,12 +22,3 @@ from mavbridge.config.policy import PolicyConfig
 def test_defaults(changes: dict[str, Any], is_dual: bool, steps: int) -> None:
     config = PolicyConfig(**changes)
     assert (config.may_be_dual, config.steps) == (is_dual, steps)
-
-
-@pytest.mark.parametrize("flag", ["--dual-rate", "--no-dual-rate", "--single-rate"])
-def test_every_spelling_of_the_rates_is_taken(
-    flag: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        main(["--connect", "nowhere", flag])
-    assert "--connect 'nowhere' is not understood" in capsys.readouterr().err

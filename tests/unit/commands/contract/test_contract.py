@@ -164,7 +164,6 @@ def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("prepare", "said"),
     [
-        (lambda folder: folder.mkdir(), "neither a LeRobot policy"),
         (lambda folder: checkpoint(folder, action_dim=6), "its action has 6 numbers, but 4 fly"),
         (lambda folder: write_json(folder / "config.json", {}), "input_features must be"),
         (lambda folder: write_json(folder / "config.json", []), "not a JSON object"),

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
+from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight
 from helpers.lerobot_rules import broken_rules
 from helpers.status import status_of
 from mavbridge.commands.config import ExportConfig
@@ -197,26 +197,11 @@ def _flights(*each: dict[str, Any]) -> Callable[[Path], None]:
     return prepare
 
 
-def _taken(root: Path) -> None:
-    fly(root / "flights" / "a")
-    (root / "out").mkdir()
-    (root / "out" / "diary.txt").touch()
-
-
-def _left_over(root: Path) -> None:
-    fly(root / "flights" / "a")
-    (root / "out.unfinished").mkdir()
-
-
 def _other_clock(root: Path) -> None:
     folder = fly(root / "flights" / "a")
     table = pq.read_table(folder / "frames.parquet")
     late = pa.array([at + 10**12 for at in table["captured_ns"].to_pylist()], pa.int64())
     pq.write_table(table.set_column(0, "captured_ns", late), folder / "frames.parquet")
-
-
-def _foreign(root: Path) -> None:
-    write_meta(root / "flights" / "a", format="something else")
 
 
 @pytest.mark.parametrize(
@@ -226,11 +211,8 @@ def _foreign(root: Path) -> None:
         (_flights({}, {"period_ms": 66}), "export them apart"),
         (_flights({}, {"contract": {"state_frame": "enu_flu"}}), "one kind at a time"),
         (_flights({"success": False}), "have failed"),
-        (_taken, "not empty"),
-        (_left_over, "was killed"),
         (_flights({"video_frames": 1}), "nothing to export"),
         (_other_clock, "of one clock"),
-        (_foreign, "not a flight of mavbridge"),
     ],
 )
 def test_bad_input_is_one_message_and_leaves_nothing(

@@ -85,7 +85,6 @@ def opened(path: Path) -> File:
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         for schema, channel, message in reader.iter_messages(log_time_order=False):
-            assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             assert message.log_time == message.publish_time
             if channel.topic not in schemas:
