@@ -154,22 +154,25 @@ def segments(sampler: Sampler, plan: RolloutPlan, decider: str) -> Iterator[Segm
 
 
 def write_flight(
-    folder: Path, *, camera_hz: float = 30.0, ticks: bool = True, meta: FlightMeta | None = None
+    folder: Path, *, ticks: bool = True, frames: bool = True, meta: FlightMeta | None = None
 ) -> Path:
-    """Write a flight of a second: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
-    events: list[Tick | VisionTick] = []
-    for index in range(100 if ticks else 0):
-        at_ns = START_NS + index * TICK_NS
-        values = make_state().values.copy()
-        values[0] = index / 100
-        sticks = Sticks(throttle=0.0, yaw=index / 1000, pitch=0.0, roll=0.0)
-        state = make_state(at_ns, values=values)
-        events.append(make_tick(index, state=state, sent=sticks, sent_ns=at_ns))
-    for k in range(round(camera_hz)):
-        rgb = np.full((48, 64, 3), grey(k), np.uint8)
-        captured_ns = START_NS + round(k / camera_hz * NS_PER_S)
-        events.append(make_vision_tick(k + 1, captured_ns=captured_ns, rgb=rgb))
+    """Write a second of a flight: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
+    events = [*map(_tick, range(100 * ticks)), *map(_frame, range(30 * frames))]
     return write_recording(folder, events, meta=meta)
+
+
+def _tick(index: int) -> Tick:
+    at_ns = START_NS + index * TICK_NS
+    values = make_state().values.copy()
+    values[0] = index / 100
+    sticks = Sticks(throttle=0.0, yaw=index / 1000, pitch=0.0, roll=0.0)
+    return make_tick(index, state=make_state(at_ns, values=values), sent=sticks, sent_ns=at_ns)
+
+
+def _frame(index: int) -> VisionTick:
+    rgb = np.full((48, 64, 3), grey(index), np.uint8)
+    captured_ns = START_NS + round(index / 30 * NS_PER_S)
+    return make_vision_tick(index + 1, captured_ns=captured_ns, rgb=rgb)
 
 
 def grey(frame: int) -> int:

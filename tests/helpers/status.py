@@ -1,5 +1,8 @@
 """The command line, run inside the test."""
 
+import io
+from contextlib import redirect_stderr, redirect_stdout
+
 import pytest
 
 from mavbridge.__main__ import main
@@ -13,6 +16,16 @@ def status_of(*arguments: object) -> int:
         main([str(argument) for argument in arguments])
     assert isinstance(stopped.value.code, int)
     return stopped.value.code
+
+
+def told_by(*arguments: object) -> tuple[int, str]:
+    """Exit status, and all that was printed, on one line."""
+    printed = io.StringIO()
+    with redirect_stdout(printed), redirect_stderr(printed):
+        status = status_of(*arguments)
+    text = " ".join(printed.getvalue().replace("│", " ").split())
+    assert "Traceback" not in text
+    return status, text
 
 
 def asked_flight(*words: object) -> FlyConfig:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
-from helpers.status import asked_flight, status_of
+from helpers.status import asked_flight, told_by
 from mavbridge.cli import cli
 from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay import replay
@@ -178,17 +178,13 @@ set = ["RC_OVERRIDE_TIME=0.5"]
 
 @pytest.mark.parametrize(("text", "flag"), REFUSED)
 def test_a_settings_file_reaches_nothing_by_itself(
-    lure: Path,
-    text: str,
-    flag: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    lure: Path, text: str, flag: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cli, "config", cli.config)
     path = lure / "mavbridge.toml"
     path.write_text(text)
-    assert status_of("--config", path, "--set-config", "link.timeout=0.1") == 2
-    shown = " ".join(capsys.readouterr().err.split())
+    status, shown = told_by("--config", path, "--set-config", "link.timeout=0.1")
+    assert status == 2
     assert f"{flag} '" in shown
     assert "--trust-config" in shown
     (found,) = untrusted_settings(read_toml(path), [])
@@ -207,14 +203,14 @@ def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
 
 
 def test_a_settings_file_that_is_trusted_may_name_a_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cli, "config", cli.config)
     path = tmp_path / "mavbridge.toml"
     path.write_text('policy = "./there_is_none.py:Mine"\ncamera = "none"\n')
     words = ("--config", path, "--trust-config", "--connect", "udp:127.0.0.1:15691")
-    assert status_of(*words) == 2
-    assert "there is no file there_is_none.py" in " ".join(capsys.readouterr().err.split())
+    status, shown = told_by(*words)
+    assert (status, "there is no file there_is_none.py" in shown) == (2, True), shown
 
 
 # --- the page

@@ -2,14 +2,13 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
-from helpers.recordings import make_frame, number_of, without_writer_process, write_recording
+from helpers.recordings import make_frame, number_of, write_recording
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.recording.flight_folder import open_flight
@@ -26,9 +25,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def flight(finished: Path, tmp_path: Path) -> Iterator[Path]:
-    with without_writer_process():
-        yield Path(shutil.copytree(finished, tmp_path / "flight"))
+def flight(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "flight"))
 
 
 def spoil(path: Path, start: int, end: int) -> None:

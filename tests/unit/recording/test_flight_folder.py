@@ -1,6 +1,6 @@
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from helpers.recordings import (
     make_frame,
     make_meta,
     number_of,
-    without_writer_process,
     write_recording,
 )
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -19,7 +18,6 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
 from policy.contract import Contract
@@ -27,12 +25,6 @@ from policy.contract import Contract
 
 def events(*, ticks: int = 30, frames: int = 10) -> list[Tick | VisionTick]:
     return [*map(make_tick, range(ticks)), *map(make_frame, range(frames))]
-
-
-@pytest.fixture(autouse=True)
-def _in_process() -> Iterator[None]:
-    with without_writer_process():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -72,16 +64,11 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
     tmp_path: Path,
 ) -> None:
     """Before the next row."""
-    writer = FlightWriter(
-        tmp_path, make_meta(contract=Contract(cameras=("front", "down"))), pressure="offline"
-    )
-    for serial in (1, 2, 5):
-        writer.tick(make_tick(serial))
-        writer.frame(make_frame(serial))
-    for serial in (0, 2):
-        writer.frame(make_frame(100 + serial, camera=1, serial=serial))
-    writer.finish(writer.meta)
-    first, below = open_flight(tmp_path, "front"), open_flight(tmp_path, "down")
+    recorded = [make(serial) for serial in (1, 2, 5) for make in (make_tick, make_frame)]
+    recorded += [make_frame(100 + serial, camera=1, serial=serial) for serial in (0, 2)]
+    meta = make_meta(contract=Contract(cameras=("front", "down")))
+    folder = write_recording(tmp_path / "flight", recorded, meta=meta)
+    first, below = open_flight(folder, "front"), open_flight(folder, "down")
     assert [(row.tick.serial, row.dropped_before) for row in first.tick_rows()] == [
         *((1, 1), (2, 0), (5, 2))
     ]
@@ -90,12 +77,12 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
         assert [row.dropped_before for row in back.frame_rows()] == dropped
     meta = first.meta
     assert (meta.frames, meta.ticks_dropped, meta.frames_dropped) == (3, 3, 3)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
+    assert sorted(path.name for path in folder.iterdir()) == [
         *("camera.mp4", "camera_down.mp4", "frames.parquet", "frames_down.parquet"),
         *("meta.json", "ticks.parquet"),
     ]
     with pytest.raises(FlightError, match="has no camera left: it has front, down"):
-        open_flight(tmp_path, "left")
+        open_flight(folder, "left")
 
 
 def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from helpers.status import status_of
+from helpers.status import status_of, told_by
 from policy.adapters.interface import read_interface
 from policy.contract import ACTION_NAMES
 from policy.errors import ContractError
@@ -60,17 +60,15 @@ def draft(source: Path, *options: str) -> Path:
     return source / "mavbridge.toml"
 
 
-def test_a_policy_alone_leaves_the_answers_to_the_user(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_policy_alone_leaves_the_answers_to_the_user(tmp_path: Path) -> None:
     checkpoint(tmp_path)
-    assert status_of("contract", f"lerobot:{tmp_path}") == 0  # as for --policy
+    status, said = told_by("contract", f"lerobot:{tmp_path}")  # as for --policy
+    assert status == 0
     path = tmp_path / "mavbridge.toml"
     with pytest.raises(ContractError) as refused:
         read_interface(path)
     missing = "chunk_dt_s, [contract] state_frame, [contract] action, [state] names, [action] names"
     assert f"5 answers are missing: [contract] {missing}" in str(refused.value)
-    said = capsys.readouterr().out
     assert "please answer: [contract] chunk_dt_s" in said
     assert "--dataset" in said
 
@@ -129,20 +127,18 @@ def test_cameras_are_called_by_the_ends_of_their_keys_or_numbered(
     assert read["images"] == dict(zip(names, keys, strict=True))
 
 
-def test_the_dataset_that_training_noted_is_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_dataset_that_training_noted_is_found(tmp_path: Path) -> None:
     names = ("vx_mps", "vy_mps", "az_mps2")
     data = dataset(tmp_path / "data", {"motors": [*names]}, az_mps2=-9.7)
     policy = checkpoint(tmp_path / "policy")
     write_json(policy / "train_config.json", {"dataset": {"root": str(data), "repo_id": "a/b"}})
-    path = draft(policy)
+    assert f"its dataset is {data}" in told_by("contract", policy)[1]
+    path = policy / "mavbridge.toml"
     interface = read_interface(path)
     assert interface.contract.chunk_dt_s == 0.05
     assert (interface.contract.state_frame, interface.contract.action) == ("ned_frd", "sticks")
     assert interface.state_names == names
     assert "# GUESSED: the mean of az_mps2 is -9.7" in path.read_text()
-    assert f"its dataset is {data}" in capsys.readouterr().out
 
 
 def test_the_file_beside_the_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
@@ -174,11 +170,11 @@ def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
-    tmp_path: Path, prepare: Any, said: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, prepare: Any, said: str
 ) -> None:
     folder = tmp_path / "source"
     prepare(folder)
     before = {path: path.read_bytes() for path in folder.rglob("*")}
-    assert status_of("contract", folder) == 2
-    assert said in " ".join(capsys.readouterr().err.split())
+    status, text = told_by("contract", folder)
+    assert (status, said in text) == (2, True), text
     assert {path: path.read_bytes() for path in folder.rglob("*")} == before

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 from rerun.chunk import RrdReader
 
 from helpers.rollouts import TinyWorld, read_rows, write_flight
-from helpers.status import status_of
+from helpers.status import told_by
 from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import Sampler
 from mavbridge.recording.video.file import count_frames
@@ -29,18 +30,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def imagine(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Imagine:
+def imagine(folder: Path, tmp_path: Path) -> Imagine:
     """Imagine into ``a.mp4``; returns exit status and output."""
     given = ("--start", folder / "flight", "--world-model", folder / "world.safetensors")
-
-    def run(*flags: str) -> tuple[int, str]:
-        out = ("--out", tmp_path / "a.mp4", "--ddim-steps", "1")
-        status = status_of("imagine", *given, *out, *flags)
-        captured = capsys.readouterr()
-        assert "Traceback" not in captured.err
-        return status, " ".join((captured.out + captured.err).split())
-
-    return run
+    return partial(told_by, "imagine", *given, "--out", tmp_path / "a.mp4", "--ddim-steps", "1")
 
 
 def test_sampling_leaves_a_core_to_decoding(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.flight_folders import write_meta, write_spot_flight
-from helpers.status import status_of
+from helpers.status import told_by
 from mavbridge.commands import train as run
 from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.networks import load_world_model
@@ -24,22 +24,20 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
 
 
-def trained(folder: Path, command: str, *flags: str, seconds: float) -> Path:
-    """Train on two short flights."""
+def trained(folder: Path, command: str, *flags: str, seconds: float) -> tuple[Path, str]:
+    """Train on two short flights; returns the checkpoint and what was printed."""
     for seed in range(2):
         write_spot_flight(folder / "flights" / str(seed), seed, seconds=seconds)
     out = folder / "trained.safetensors"
-    assert status_of(command, str(folder / "flights"), "--out", str(out), *flags) == 0
-    return out
+    status, text = told_by(command, folder / "flights", "--out", out, *flags)
+    assert status == 0
+    return out, text
 
 
-def test_a_checkpoint_is_trained_and_loads_to_fly(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = trained(tmp_path, "train", *SMALL, "--steps", "3", "--ages", "40:90", seconds=0.5)
-    printed = capsys.readouterr()
-    assert "held-out loss" in printed.out
-    assert "stick error" in printed.out
+def test_a_checkpoint_is_trained_and_loads_to_fly(tmp_path: Path) -> None:
+    out, text = trained(tmp_path, "train", *SMALL, "--steps", "3", "--ages", "40:90", seconds=0.5)
+    assert "held-out loss" in text
+    assert "stick error" in text
     request = PolicyRequest(spec="toge", checkpoint=out, engine="torch", num_diffusion_steps=2)
     loaded = load_policy(request, now_s=lambda: 0.0)
     runner = loaded.runner
@@ -50,31 +48,29 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
     assert runner.act(feature, state, history).shape == (1, 16, 4)
 
 
-def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_world_model_is_trained(tmp_path: Path) -> None:
     flags = ("--image-size", "32", "--steps", "2")
-    out = trained(tmp_path, "train-world-model", *flags, seconds=2.0)
-    printed = capsys.readouterr()
-    assert "imagined to" in printed.out
+    out, text = trained(tmp_path, "train-world-model", *flags, seconds=2.0)
+    assert "imagined to" in text
     model = load_world_model(out)
     assert model.config.image_size == 32
     assert model.config.contract.state_frame == "ned_frd"
 
 
 def test_ctrl_c_keeps_the_best_weights_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_spot_flight(tmp_path / "flights" / "0", 0, seconds=0.5)
     out = tmp_path / "a.safetensors"
-    command = ("train", str(tmp_path / "flights"), "--out", str(out), *SMALL, "--steps", "8")
 
     def interrupt(_bar: object, _task: object, progress: TrainingProgress) -> None:
         if progress.stage.startswith("encoding"):
             signal.raise_signal(signal.SIGINT)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "_show", interrupt)
-        assert status_of(*command) == INTERRUPTED
-    assert "holds the best weights so far" in capsys.readouterr().err.replace("\n", " ")
+    monkeypatch.setattr(run, "_show", interrupt)
+    status, text = told_by("train", tmp_path / "flights", "--out", out, *SMALL, "--steps", "8")
+    assert status == INTERRUPTED
+    assert "holds the best weights so far" in text
     assert out.is_file()
 
 
