@@ -177,7 +177,6 @@ def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> No
     assert flight.camera.sources == ("none",)
     assert flight.link.raw_sticks
     assert flight.takeoff == 10.0
-    assert flight.duration is not None
     assert flight.duration > doublet_length_s("velocity") + 8.0
     mapped = doublet_flight(IdentifyConfig(flight=asked, mapped_sticks=True), Contract())
     assert not mapped.link.raw_sticks

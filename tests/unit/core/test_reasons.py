@@ -62,6 +62,12 @@ def test_a_late_chunk_names_what_stood_still(code: Code, place: str, text: str) 
     assert str(because(code, **LATE, place=place)) == f"attitude 104 ms old {text}"
 
 
+def test_a_flight_process_that_answers_did_not_stand_still() -> None:
+    late = because(Code.LATE, **LATE, place="flight process", said=because(Code.NOT_FINITE))
+    said = "the policy returned a value that is not finite; attitude 104 ms old (limit 100 ms)"
+    assert str(late) == said
+
+
 def test_a_reason_inside_another_keeps_its_code_and_gives_its_kind() -> None:
     both = because(Code.THEN, first=because(Code.DURATION), then=DISARMED)
     assert both.codes == (Code.THEN, Code.DURATION, Code.DISARMED)

@@ -42,7 +42,6 @@ def test_any_number_of_signals_at_once_is_one_stop(module: str, context: str, as
     with subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as waiting:
-        assert waiting.stdout is not None
         assert waiting.stdout.readline() == "ready\n"
         for _ in range(5_000):
             waiting.send_signal(signal.SIGINT)
@@ -79,7 +78,6 @@ def test_a_second_ctrl_c_while_a_start_cleans_up_is_no_traceback() -> None:
         stderr=subprocess.PIPE,
         text=True,
     ) as starting:
-        assert starting.stdout is not None
         assert starting.stdout.readline() == "started\n"
         starting.send_signal(signal.SIGINT)
         assert starting.stdout.readline() == "cleaning up\n"

@@ -18,7 +18,6 @@ def verdict_lines(report: TimingReport) -> list[str]:
 
 def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
     table = timing_table(report_of(*(make_tick(index) for index in range(11))))
-    assert table is not None
     console = Console(file=io.StringIO(), width=100, record=True)
     console.print(table)
     text = console.export_text()

@@ -32,11 +32,8 @@ class RecorderStand:
             autopilot=lambda: "ardupilot 4.6.0",
             report=self.told.append,
         )
-        (process,) = (
-            child for child in multiprocessing.active_children() if child.name == "mavbridge-writer"
-        )
-        assert process.pid is not None
-        self.pid = process.pid
+        children = multiprocessing.active_children()
+        (self.pid,) = (child.pid for child in children if child.name == "mavbridge-writer")
 
     def __enter__(self) -> "RecorderStand":
         return self

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from helpers.factories import make_state, make_tick, make_trace
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
-from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
+from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,
-    TICKS,
     FrameRow,
     FrameTruth,
     TickRow,
@@ -118,13 +117,3 @@ def test_the_columns_are_those_of_the_document() -> None:
     tables = (DEMONSTRATION_TICKS, DEMONSTRATION_FRAMES)
     names = {name for table in tables for name in table.names}
     assert [name for name in names if name not in text] == []
-
-
-def test_actions_of_another_kind_come_back_as_that_kind() -> None:
-    moves = Velocity(1.0, -2.0, 0.5, 0.25)
-    trace = ActionTrace(raw=moves, clipped=moves, slewed=moves, smoothed=moves)
-    tick = make_tick(sent=moves, trace=trace)
-    table = pa.Table.from_pylist([tick_columns(TickRow(tick, 0))], TICKS)
-    (row,) = read_ticks(table, "velocity")
-    assert (row.tick.sent, row.tick.trace) == (moves, trace)
-    assert isinstance(row.tick.sent, Velocity)

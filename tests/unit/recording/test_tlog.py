@@ -54,20 +54,6 @@ def send(link: PacketPipe, count: int) -> None:
         link.put(Packet(k * 1000, b"%05d" % k))
 
 
-def test_everything_is_written_in_order_also_what_came_before_the_thread(
-    tmp_path: Path, pipe: TlogPipe, link: PacketPipe
-) -> None:
-    path = tmp_path / "link.tlog"
-    send(link, 3_000)
-    thread = TlogThread(TlogJob(path, pipe.reader))
-    send(link, 3_000)
-    link.close()
-    thread.finish(DEADLINE_S)
-    assert numbers(path) == [*range(3_000), *range(3_000)]
-    assert link.dropped == 0
-    assert thread.failure is None
-
-
 @pytest.mark.parametrize(
     ("name", "deadline_s", "failure"),
     [("link.tlog", 0.0, None), ("missing/link.tlog", DEADLINE_S, FileNotFoundError)],
@@ -90,7 +76,6 @@ def test_a_pipe_that_does_not_end_or_cannot_be_written_is_left(
 def test_a_log_that_cannot_be_written_is_the_writers_failure(
     video: VideoWriter, link: PacketPipe
 ) -> None:
-    assert video.pid is not None
     resource.prlimit(video.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
     send(link, 1_000)
     with pytest.raises(WriterError, match=r"the log of the link cannot be written: .*File too"):
@@ -104,7 +89,6 @@ def test_the_log_goes_on_after_the_recording_was_finished(
     for k in range(5):
         video.submit(picture(k), make_row(k))
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
-        assert video.pid is not None
         os.kill(video.pid, number)
     video.finish()
     assert count_frames(tmp_path / "camera.mp4") == 5

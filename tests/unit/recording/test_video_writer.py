@@ -31,11 +31,6 @@ def writer(folder: Path, pressure: Pressure) -> closing[VideoWriter]:
     )
 
 
-def kill(video: VideoWriter, number: signal.Signals) -> None:
-    assert video.pid is not None
-    send_signal(video.pid, number)
-
-
 def read_back(folder: Path) -> tuple[list[int], list[int]]:
     """Numbers of the images, and of their rows."""
     rows = read_table(folder / "frames", FRAMES)["frame_id"].to_pylist()
@@ -66,7 +61,7 @@ def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
     with writer(tmp_path, "offline") as video:
         video.submit(picture(0), make_row(0))
-        kill(video, signal.SIGSTOP)
+        send_signal(video.pid, signal.SIGSTOP)
         reasons: list[str] = []
         has_begun = threading.Event()
 
@@ -81,7 +76,7 @@ def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> No
         producer = threading.Thread(target=produce)
         producer.start()
         assert has_begun.wait(DEADLINE_S)
-        kill(video, signal.SIGKILL)
+        send_signal(video.pid, signal.SIGKILL)
         producer.join(DEADLINE_S)
         assert len(reasons) == 1
         assert "has died" in reasons[0]

@@ -57,6 +57,15 @@ def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str])
     assert rows["policy"]["verdict"] == "no-go", "a policy that cannot be loaded is a row"
 
 
+def test_a_policy_and_a_computer_are_checked_without_a_vehicle(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = replace(flight("scripted:hover"), link=LinkConfig(connect="none"))
+    assert check(CheckConfig(timing=0.5, flight=config, json=Path("-"))) == ExitCode.DONE
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert {row["area"] for row in rows} == {"link", "policy", "computer"}
+
+
 @pytest.mark.parametrize(
     ("each_ms", "rate_hz", "late", "verdict"),
     [(4, 100.0, 0, "go"), (9, 100.0, 0, "warn"), (20, 50.0, 49, "warn")],
@@ -103,5 +112,4 @@ def test_a_policy_tells_its_engine_speed_and_contract_and_which_flag_contradicts
     rows, plan = check_policy(replace(config, mode="ALT_HOLD"), MonotonicClock(), timing_s=0.5)
     assert (rows[-1].name, rows[-1].verdict) == ("flags of the flight", "no-go")
     assert "--mode ALT_HOLD" in rows[-1].advice
-    assert plan is not None
     assert plan.guard.meaning.kind == "velocity"

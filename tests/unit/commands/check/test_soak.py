@@ -1,6 +1,5 @@
 """The figures of a soak, the description of a computer, and the row of both."""
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -100,10 +99,6 @@ def test_figures_are_those_between_two_readings_a_second_apart() -> None:
     soak = meter.figures()
     assert 0 < soak.cpu_cores["flight"] < 1
     assert "flight/MainThread" in soak.cpu_cores
-    document = json.loads(json.dumps(soak.document()))
-    assert document["timing"]["policy"] == "mine"
-    assert document["timing"]["mode"] == "dual"
-    assert document["computer"]["cores"] >= 1
     computer = replace(soak.computer, cores=2)
     row = replace(soak, computer=computer, hottest_c=71.4).row()
     assert row.verdict == "warn"

@@ -4,24 +4,12 @@ import pytest
 
 from helpers.evaluated_flights import FINISHED, crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
-from mavbridge.commands.evaluate import (
-    FlownEpisode,
-    mean,
-    rate,
-    summarise,
-)
-from mavbridge.config.episodes import EvaluateConfig
+from mavbridge.commands.evaluate import mean, rate, summarise
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import StickMeter
 from sitl.course import make_course
 
-CONFIG = EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0)
-FLOWN = {
-    index: FlownEpisode(engine="openvino", result=result)
-    for index, result in enumerate((finished(), crashed(lost=because(Code.DISARMED))))
-}
 GATES = make_course(FINISHED.course_seed).gates
 LEG_M = math.dist(GATES[0].center_ned_m, GATES[1].center_ned_m)
 
@@ -77,7 +65,6 @@ def test_intervals_are_those_of_the_textbook(
 
 def test_the_interval_of_a_mean_is_that_of_its_standard_error() -> None:
     spread = mean([float(value) for value in range(100)])
-    assert spread is not None
     # Mean 49.5, deviation 28.87, standard error 2.887.
     assert spread.low == pytest.approx(49.5 - 1.96 * 2.887, abs=0.3)
     assert spread.high == pytest.approx(49.5 + 1.96 * 2.887, abs=0.3)

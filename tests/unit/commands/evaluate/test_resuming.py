@@ -64,11 +64,9 @@ def test_what_was_flown_is_on_disk_and_not_flown_again(
     assert evaluate(config) == 0
     assert flights.on_disk == [1, 2, 3, 4], "each flight, as the next one begins"
     assert flights.flown == [0, 1, 2, 3, 4]
-    assert config.json is not None
     flights.path = None
     at_once = replace(config, json=tmp_path / "at_once.json")
     evaluate(at_once)
-    assert at_once.json is not None
     assert config.json.read_text() == at_once.json.read_text()
 
 
@@ -77,7 +75,6 @@ def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
 ) -> None:
     evaluate(config)
     evaluate(replace(config, episodes=7, workers=WorkersConfig(workers=1)))
-    assert config.json is not None
     text = config.json.read_text()
     with pytest.raises(UserError, match="holds 7 flights"):
         evaluate(replace(config, episodes=2))
@@ -101,7 +98,6 @@ def test_flights_by_other_flags_or_weights_are_not_mixed(
 
 def test_flights_of_another_engine_are_not_mixed(flights: Flights, config: EvaluateConfig) -> None:
     evaluate(config)
-    assert config.json is not None
     before = config.json.read_text()
     flights.engine = "torch"
     with pytest.raises(UserError, match="flown by the engine numpy, here it is torch"):
@@ -113,7 +109,6 @@ def test_flights_of_another_engine_are_not_mixed(flights: Flights, config: Evalu
 def test_a_file_that_is_no_evaluation_is_refused_and_kept(
     config: EvaluateConfig, text: str
 ) -> None:
-    assert config.json is not None
     config.json.write_text(text)
     with pytest.raises(UserError, match="no evaluation that can go on"):
         evaluate(config)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from helpers.evaluated_flights import finished
+from helpers.evaluated_flights import crashed, finished
 from mavbridge.commands.evaluate import (
     INTERRUPTED,
     EpisodeSpec,
@@ -57,6 +57,7 @@ def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(tmp_path: Path
     assert written("nominal", "second") == first
     nominal, random = json.loads(first), json.loads(written("random", "third"))
     assert nominal["summary"]["outcomes"] == {"timed out": 2}
+    assert (nominal["asked_episodes"], nominal["vision_delay_ms"]) == (2, 0.0)
     assert (nominal["conditions"], random["conditions"]) == ("nominal", "random")
     for a, b in zip(nominal["episodes"], random["episodes"], strict=True):
         assert a["distance_m"] != b["distance_m"]
@@ -88,7 +89,7 @@ def test_a_flight_says_why_the_policy_lost_control(stalls: float, codes: tuple[C
 
 
 def flown(spec: EpisodeSpec) -> FlownEpisode:
-    result = finished(course_seed=spec.course_seed, seed=spec.seed)
+    result = (finished, crashed)[spec.index](course_seed=spec.course_seed, seed=spec.seed)
     return FlownEpisode(engine="numpy", notes=("mind the gap",), result=result)
 
 
@@ -102,11 +103,14 @@ def test_ctrl_c_ends_with_the_results_so_far(
 
     monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
     path = tmp_path / "some.json"
-    assert evaluate(EvaluateConfig(policy=CIRCLE, episodes=5, json=path)) == INTERRUPTED
+    config = EvaluateConfig(policy=CIRCLE, episodes=5, vision_delay=50.0, json=path)
+    assert evaluate(config) == INTERRUPTED
     assert len(json.loads(path.read_text())["episodes"]) == 2
-    shown = capsys.readouterr().err
-    assert "interrupted after 2 of 5 episodes" in shown
-    assert shown.count("mind the gap") == 1
+    shown = capsys.readouterr()
+    assert "interrupted after 2 of 5 episodes" in shown.err
+    assert shown.err.count("mind the gap") == 1
+    assert "images 50 ms later" in shown.out
+    assert "2 flights: 1 finished, 1 crashed" in shown.out
 
 
 def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:

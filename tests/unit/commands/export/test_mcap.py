@@ -166,10 +166,16 @@ def test_a_demonstration_has_all_its_rows_at_their_times(start: File) -> None:
     for name in ("raw", "smoothed", "sent", "expert", "rc_sticks"):
         found = [[*entry.message[name].values()] for entry in start.of("/actions")]
         np.testing.assert_array_equal(found, ticks[name].to_pylist())
-    for entry, (north, east, down) in zip(
-        start.of("/tf"), frames["position_ned_m"].to_pylist(), strict=True
-    ):
+
+
+def test_poses_of_a_simulator_are_in_enu_and_flu(start: File) -> None:
+    rows = pq.read_table(START / "frames.parquet").to_pylist()
+    for entry, row in zip(start.of("/tf"), rows, strict=True):
+        north, east, down = row["position_ned_m"]
         assert [*entry.message["translation"].values()] == [east, north, -down]
+        turn = tuple(entry.message["rotation"][axis] for axis in "wxyz")
+        north, east, down = rotate(tuple(row["ned_from_body_wxyz"]), (0, 1, 0))  # the right side
+        assert rotate(turn, (0, -1, 0)) == pytest.approx((east, north, -down), abs=1e-6)
 
 
 def test_images_are_those_of_the_video(flight: File, start: File) -> None:

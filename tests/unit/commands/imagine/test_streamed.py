@@ -46,12 +46,6 @@ def make_segment(iteration: int) -> Segment:
     )
 
 
-def pid_of(made: StreamedOutput) -> int:
-    assert made.video is not None
-    assert made.video.pid is not None
-    return made.video.pid
-
-
 def require_whole(out: Path, at_least: int) -> None:
     """Readable to the end, and a row for each frame."""
     frames = count_frames(out)
@@ -69,7 +63,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
     out = tmp_path / "a.mp4"
     with output(out) as made:
         made.put(make_segment(0))
-        send_signal(pid_of(made), signal.SIGSTOP)
+        send_signal(made.video.pid, signal.SIGSTOP)
         put: list[int] = []
         is_full = threading.Event()
 
@@ -85,7 +79,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
         assert is_full.wait(DEADLINE_S)
         # the ring of 32 frames, the segment in the thread's hands, the queue, the one being put
         assert len(put) <= 2 + 1 + QUEUED_SEGMENTS + 1
-        send_signal(pid_of(made), signal.SIGCONT)
+        send_signal(made.video.pid, signal.SIGCONT)
         producer.join(DEADLINE_S)
         assert len(put) == 19
         made.finish()

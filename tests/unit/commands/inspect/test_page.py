@@ -37,7 +37,6 @@ def flight(folder: Path, *, name: str = "scripted:hover", frames: int = 10) -> F
 def data_of(text: str) -> list[dict[str, Any]]:
     """What a browser reads from the page."""
     found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)
-    assert found is not None
     read: list[dict[str, Any]] = json.loads(found[1])
     return read
 

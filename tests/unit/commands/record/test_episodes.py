@@ -44,7 +44,6 @@ class Stand:
     def record(self, first: int, count: int = 3, **changes: object) -> None:
         """One episode of ticks and frames whose numbers begin at ``first``."""
         self.episodes.begin()
-        assert self.log is not None
         self.log.put(Packet(0, PACKET))
         for number in range(first, first + count):
             self.episodes.emit(make_tick(number, **changes))
