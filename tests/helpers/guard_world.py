@@ -1,13 +1,11 @@
 """Surroundings of a flight in memory: a link with faults, a readable channel, no camera."""
 
-import random
 from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Reason
 from mavbridge.core.records import FeatureFrame, Frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.guard.wire import FromGuard, decode_from_guard
@@ -17,32 +15,30 @@ from mavbridge.simulation.guard import MemoryPort
 from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
 
 MS = NS_PER_MS
+DELAY_NS = NS_PER_MS * 3 // 10
 
 
 class Direction(DelayedChannel):
     """One direction of the link, whose faults can be changed in flight."""
 
     def __init__(self, clock: SteppedClock) -> None:
-        self.delay_ns = NS_PER_MS * 3 // 10
-        self.loss = 0.0
         self.is_silent = False
         self.bytes_per_s = 0.0
         """Bandwidth; packets behind half a second of others are dropped. 0: unlimited."""
         self._free_ns = 0
         self.sent: list[tuple[int, bytes]] = []
         """Every datagram with its time, including lost ones."""
-        self._draw = random.Random(1)
         self._world = clock
         super().__init__(clock, self._delays_ns())
 
     def _delays_ns(self) -> Iterator[int]:
         while True:
-            yield self.delay_ns + max(self._free_ns - self._world.now_ns(), 0)
+            yield DELAY_NS + max(self._free_ns - self._world.now_ns(), 0)
 
     def send(self, data: bytes) -> None:
         now_ns = self._world.now_ns()
         self.sent.append((now_ns, data))
-        if self.is_silent or self._draw.random() < self.loss:
+        if self.is_silent:
             return
         if self.bytes_per_s:
             if self._free_ns - now_ns > 500 * MS:
@@ -101,23 +97,19 @@ class FlightPort(MemoryPort):
 
 
 class FreshFeatures(FeatureCache):
-    """Camera without faults, except for those that a test sets."""
+    """Camera without faults."""
 
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__()
         self._clock = clock
-        self.fault: Reason | None = None
-        self.stopped_ns: int | None = None
-        """Exposure of the last image; None: just now."""
 
     def latest(self) -> FeatureFrame:
-        captured_ns = self.stopped_ns or self._clock.now_ns() - 20 * MS
+        captured_ns = self._clock.now_ns() - 20 * MS
         return FeatureFrame(
             frame_id=captured_ns // MS,
             captured_ns=captured_ns,
             ready_ns=captured_ns,
             value=np.zeros((1, 1), np.float32),
-            fault=self.fault,
         )
 
 

@@ -13,7 +13,6 @@ from mavbridge.guard.values import Phase
 from mavbridge.mavlink.transport.connection import REFUSED_NS
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind
-from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import (
     MID_RECEIVER_US,
     ArduPilotRelease,
@@ -50,24 +49,6 @@ def test_a_second_way_to_the_vehicle_is_not_followed_where_the_first_one_pauses(
     flight.until(lambda: flight.phase is not Phase.FLYING, within_s=1)
     flight.run(1)
     assert not any(Code.MOVED in codes(tick.reason) for tick in flight.ticks)
-
-
-def test_a_reboot_in_flight_is_latched_and_still_leaves_a_release() -> None:
-    flight = GuardFlight().fly()
-    flight.run(2)
-    before_ns = flight.clock.now_ns()
-    flight.vehicle.reboot()
-    flight.until(lambda: flight.phase in (Phase.RELEASING, Phase.RELEASED), within_s=1.5)
-    flight.run(8)
-
-    assert flight.phase is Phase.RELEASED
-    assert not flight.modes_asked(before_ns)
-    assert flight.overrides(before_ns)[-1][1] == (0, 0, 0, 0)
-    assert any("has rebooted" in text for text in flight.messages)
-    flight.ap.set_mode(Mode.ALT_HOLD)
-    flight.ap.arm(force=True)
-    flight.run(2)
-    assert flight.phase is Phase.RELEASED, "armed and ready again, and nobody has asked"
 
 
 def test_a_parameter_is_set_for_the_flight_and_put_back_before_the_guard_ends() -> None:
@@ -131,20 +112,6 @@ def test_in_flight_refused_packets_are_a_fault_of_the_link_after_100_ms(
     assert took_s <= REFUSED_NS / 1e9 + 2 * SLOT_S
     assert flight.phase is Phase.LEAVING
     assert flight.guard.outcome.faults == 1
-
-
-def test_packets_that_are_refused_before_an_act_refuse_it() -> None:
-    flight = GuardFlight().launch()
-    refuse(flight)
-    flight.run(1.5)
-    flight.act("engage")
-    flight.run(5)
-    assert Phase.FLYING not in flight.phases()
-    refuse(flight, is_refused=False)
-    flight.run(1.5)
-    flight.act("engage")
-    flight.run(0.2)
-    assert flight.phase is Phase.FLYING
 
 
 @pytest.mark.parametrize("gap_s", [0.03, 0.06, 0.07])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -229,23 +229,6 @@ def test_an_action_that_takes_longer_than_its_slot_costs_no_slot() -> None:
     assert {tick.missed_slots for tick in ticks} == {0}
     assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) < 15 * MS
     assert len({tick.chunk_serial for tick in ticks}) == pytest.approx(1000 / 25, abs=3)
-
-
-@pytest.mark.parametrize(("max_stall_s", "flies"), [(0.1, False), (0.2, True)])
-def test_a_stall_of_the_flight_process_is_flown_through_as_long_as_the_contract_says(
-    max_stall_s: float, flies: bool
-) -> None:
-    stalled = replace(BLIND, delays=replace(FIXED, stall_ns=130 * MS))
-    sink, pilot = ListSink(), steady(lambda: CLIMB)
-    pilot = replace(pilot, contract=replace(pilot.contract, max_stall_s=max_stall_s))
-    flight(stalled).fly(pilot, max_time_s=6.0, sinks=(sink,))
-    ticks = flown(sink)
-    assert (ticks[-1].sent_ns - ticks[0].sent_ns > 5 * NS_PER_S) == flies
-    stalls = [len(list(run)) for old, run in groupby(ticks, lambda t: t.is_coasting) if old]
-    assert len(stalls) >= (2 if flies else 1)
-    assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) < 15 * MS, "no slot is missed"
-    if flies:
-        assert all(10 <= count <= 14 for count in stalls), "130 ms, of which 20 are not overdue"
 
 
 def test_single_rate_takes_the_time_of_the_whole_network_for_every_action() -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.output_flights import COMBINATIONS, OutputFlight
 from mavbridge.core.clock import NS_PER_S
@@ -28,6 +27,8 @@ GRACE_MS = 120
 STALL_MS = 270
 """``max_stall_s`` of a new contract, and 20 ms."""
 DEATH_MS = 60
+CUT_MS = 1660
+"""A cut of 1.5 s, and the next request of the mode."""
 PX4_STREAM_LOST_MS = 1050
 """COM_OF_LOSS_T, and a step; sticks are lost after 0.6 s."""
 UNLIKE: tuple[tuple[AutopilotName, ActionKind], ...] = (
@@ -37,11 +38,8 @@ UNLIKE: tuple[tuple[AutopilotName, ActionKind], ...] = (
     ("px4", "rates"),
 )
 """Where the guard alone decides, these stand for the others."""
-FORCE = 21196
-"""Parameter 2 of a disarming that is not refused in flight."""
 RAMP_S = 0.3
 EACH = pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-SOME = pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
 
 
 def later(flight: OutputFlight, seconds: float, act: Callable[[], object]) -> None:
@@ -97,6 +95,11 @@ def land(flight: OutputFlight) -> str:
     return "AUTO.LAND" if flight.is_px4 else "LAND"
 
 
+def after_a_cut(flight: OutputFlight) -> str:
+    """Setpoints of ours would bring PX4 back into OFFBOARD: its own failsafe is left alone."""
+    return "AUTO.RTL" if flight.is_px4 and flight.kind != "sticks" else hold(flight)
+
+
 class Way(NamedTuple):
     """A way in which a flight ends by our doing."""
 
@@ -114,6 +117,7 @@ WAYS = {
     "NaN": Way(OutputFlight.return_nan, GRACE_MS, UNLIKE, code=Code.UNUSABLE_CHUNKS),
     "refused": Way(refuse_commands, DEATH_MS, UNLIKE, code=Code.COMMAND_FAILED),
     "not heard": Way(lambda flight: silence(flight, down_s=2.0), GRACE_MS),
+    "cut": Way(lambda flight: silence(flight, up_s=1.5, down_s=1.5), CUT_MS, UNLIKE, after_a_cut),
     "end": Way(OutputFlight.stop, DEATH_MS, mode=land_px4),
     "no position": Way(die_without_position, 50 + DEATH_MS + 100, UNLIKE, mode=land),
     "guard killed": Way(OutputFlight.kill_guard, 20),
@@ -209,16 +213,6 @@ def test_a_pilots_stick_ramp_takes_px4_out_of_offboard(kind: ActionKind) -> None
     assert not flight.modes_asked()[1:], "only OFFBOARD itself was asked for"
 
 
-@SOME
-def test_a_disarming_in_flight(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind).fly(1.2)
-    flight.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
-    flight.run(1.0)
-    assert not flight.samples[-1].armed
-    assert flight.codes == (Code.DISARMED,)
-    assert flight.phase in (Phase.RELEASING, Phase.RELEASED)
-
-
 @EACH
 def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_never_again(
     autopilot: AutopilotName, kind: ActionKind
@@ -243,23 +237,6 @@ def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_ne
         # It hears neutral sticks at once, and for setpoints the next request of the mode.
         assert found.neutral_ms < 1500 + (60 if kind == "sticks" else 160)
         assert found.final_mode == hold(flight)
-
-
-@SOME
-def test_a_link_that_is_cut_both_ways_is_no_way_back(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    """Setpoints of ours after it would bring PX4 back into OFFBOARD: there are none."""
-    flight = OutputFlight(autopilot, kind).fly(1.2)
-    at_s = flight.t_s
-    silence(flight, up_s=1.5, down_s=1.5)
-    flight.run(4.0)
-    found = flight.aftermath(at_s)
-    assert not found.flew_again, found
-    # A failsafe of PX4 that has acted meanwhile is left alone.
-    is_returning = flight.is_px4 and kind != "sticks"
-    assert found.final_mode == ("AUTO.RTL" if is_returning else hold(flight)), flight.describe()
-    assert flight.phase is not Phase.FLYING
 
 
 @EACH

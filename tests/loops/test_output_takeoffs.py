@@ -74,23 +74,3 @@ def test_a_takeoff_is_ended_by_the_death_of_the_flight_process(
     assert flight.samples[-1].mode == hold, flight.describe()
     assert flight.height_m < HEIGHT_M + 0.5
     assert not any(s.failsafe for s in flight.samples)
-
-
-def test_a_takeoff_without_a_position_is_not_begun() -> None:
-    flight = OutputFlight("px4", "velocity", HOVERING, arm=True, takeoff=HEIGHT_M)
-    flight.lose_position()
-    flight.run(15)
-    assert not any(s.armed for s in flight.samples)
-    assert flight.phase is Phase.PREPARING, flight.describe()
-    assert flight.codes == (Code.TOO_OLD,), flight.reason
-    assert dict(flight.reason.data)["quantity"] == "velocity"
-
-
-def test_a_policy_that_never_lifts_px4_off_is_disarmed_by_it() -> None:
-    flight = OutputFlight("px4", "velocity", HOVERING, arm=True)
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=15)
-    flight.run(11)
-    assert flight.codes == (Code.DISARMED,)
-    flight.run(3)
-    assert flight.phase is Phase.RELEASED
-    assert not flight.samples[-1].armed
