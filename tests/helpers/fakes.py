@@ -1,14 +1,11 @@
 """Test doubles: a virtual clock, a recording sink, a vehicle in memory."""
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from helpers.guard_facts import COPTER_MODES
 from mavbridge.core.clock import NS_PER_S, Clock
-from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
     NEUTRAL,
@@ -18,7 +15,6 @@ from mavbridge.core.vehicle import (
     Decision,
     LinkArrivals,
     LinkSnapshot,
-    LinkStats,
     Outlet,
     Output,
     Reading,
@@ -93,28 +89,20 @@ def level_telemetry(arrived_ns: int) -> Telemetry:
 
 
 class FakeLink:
-    """The guard's link to a vehicle in memory, which obeys at once. ``vehicle`` can be replaced."""
+    """The guard's link to a vehicle in memory, which obeys at once."""
+
+    autopilot = "fake 1.0"
+    is_release_owed = False
 
     def __init__(self, clock: Clock, **status: Any) -> None:
         self._clock = clock
         self._samples: tuple[Sample, ...] = ()
         self._telemetry = Telemetry()
-        self._happened_ns = 0
         self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
-        self.problem: Reason | None = None
-        self.overruled: Reason | None = None
-        self.interruption: Reason | None = None
-        self.is_release_owed = False
-        self.echo_confirmed = True
-        self.obeys = True
-        """True if it follows requests for a mode and to arm."""
-        self.lacks: str | None = None
-        """Field of ``Telemetry`` that the vehicle no longer sends."""
         self.texts: list[str] = []
         self.is_engaged = False
         self.is_restored = True
         self.commands = self
-        self.autopilot = "fake 1.0"
         self.decisions: list[tuple[int, Decision]] = []
         self.requests: list[str] = []
         self.announced: list[str] = []
@@ -124,40 +112,19 @@ class FakeLink:
         self.services = 0
         self.restores = 0
         self.on_send: Callable[[], None] = lambda: None
-        self.takes: Callable[[Decision], bool] = lambda decision: True
-        """Returns True if a decision can be sent now; can raise."""
 
-    def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
-        """Send the vehicle's state, which arrives now and happened ``age_ns`` ago.
-
-        The link ignores a state older than the one before.
-        """
-        happened_ns = self._clock.now_ns() - age_ns
-        if happened_ns < self._happened_ns:
-            return
-        self._happened_ns = happened_ns
-        quaternion = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
-        velocity, force = (0.0, 0.0, down_mps), (0.0, 0.0, -9.80665)
-        none = (0.0,) * 3
-        reading = partial(Reading, self._clock.now_ns(), delay_ns=age_ns)
+    def measure(self, *, age_ns: int = 0) -> None:
+        """Send the vehicle's state, which arrives now and happened ``age_ns`` ago."""
+        level = level_telemetry(self._clock.now_ns())
         self._telemetry = Telemetry(
-            ned_from_body_wxyz=reading(quaternion),
-            rate_body_radps=reading(none),
-            velocity_ned_mps=reading(velocity),
-            specific_force_body_mps2=reading(force),
+            **{s.quantity: s.reading._replace(delay_ns=age_ns) for s in samples_of(level)}
         )
-        self._samples += tuple(s for s in samples_of(self._telemetry) if s.quantity != self.lacks)
+        self._samples += samples_of(self._telemetry)
 
     def change(self, **status: Any) -> None:
         """Replace fields of the vehicle's status."""
         assert self.status is not None
         self.status = replace(self.status, **status)
-
-    @property
-    def hands(self) -> list[Decision]:
-        """Sent decisions, without repeats."""
-        sent = [decision for _, decision in self.decisions]
-        return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
     def receive(self) -> LinkArrivals:
         samples, self._samples = self._samples, ()
@@ -172,11 +139,8 @@ class FakeLink:
         return LinkSnapshot(
             telemetry=self._telemetry,
             status=status,
-            problem=self.problem or self.overruled,
-            is_overruled=self.overruled is not None,
-            interruption=self.interruption,
-            interruptions=int(self.interruption is not None),
-            echo_confirmed=self.echo_confirmed,
+            problem=None,
+            echo_confirmed=True,
             is_released=not holds,
             modes=COPTER_MODES,
             texts=texts,
@@ -185,18 +149,11 @@ class FakeLink:
     def send_before_action(self) -> None:
         pass
 
-    def begin_flight(
-        self, meaning: ActionMeaning, output: Output | None, *, watches_home_height: bool = False
-    ) -> None:
-        self.meaning = meaning
-
-    def takeoff(self, height_m: float) -> None:
-        self.requests.append(f"takeoff {height_m:g}")
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None, **watches: bool) -> None:
+        pass
 
     def send(self, decision: Decision, decided_ns: int) -> Action | None:
         self.on_send()
-        if not self.takes(decision):
-            return None
         self.decisions.append((self._clock.now_ns(), decision))
         return None if isinstance(decision, Release) else decision.action
 
@@ -205,13 +162,7 @@ class FakeLink:
 
     def set_mode(self, mode: str) -> None:
         self.requests.append(f"mode {mode}")
-        if self.obeys:
-            self.change(mode=mode)
-
-    def arm(self) -> None:
-        self.requests.append("arm")
-        if self.obeys:
-            self.change(armed=True)
+        self.change(mode=mode)
 
     def announce(self, text: str) -> None:
         self.announced.append(text)
@@ -235,15 +186,6 @@ class FakeLink:
     def restore(self) -> bool:
         self.restores += 1
         return self.is_restored
-
-    def stats(self) -> LinkStats:
-        return LinkStats(
-            messages_per_s=(),
-            lost_fraction=None,
-            rtt_ms=None,
-            sent_overrides=len(self.decisions),
-            echo_confirmed=self.echo_confirmed,
-        )
 
 
 def without(telemetry: Telemetry, field_name: str) -> Telemetry:
