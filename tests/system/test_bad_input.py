@@ -97,26 +97,6 @@ def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_flight_leaves_no_empty_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = tmp_path / "report.json"
-    flags = ("--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop", "--report", str(report))
-    status, _ = run(capsys, *flags)
-    assert status == 2
-    assert not report.exists()
-
-
-def test_an_unknown_config_key_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "flight.toml"
-    path.write_text('connect = "udp:127.0.0.1:1"\nvisual-rat = 30\n')
-    status, text = run(capsys, "--config", str(path))
-    assert status != 0
-    assert "visual-rat" in text
-
-
 def test_a_corrupt_checkpoint_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"these are no weights")

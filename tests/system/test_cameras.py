@@ -61,14 +61,6 @@ def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
     assert "Traceback" not in output
 
 
-def test_a_camera_without_its_name_is_refused(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
-        status, output = flying.fly(*FLY, "--policy", faulty_policy("TwoEyed"))
-    assert status == 2, output
-    assert "give --camera front=SOURCE --camera down=SOURCE" in output
-    assert flying.relay.overrides == []
-
-
 @pytest.fixture
 def depth_policy(tmp_path: Path) -> str:
     path = tmp_path / "deep.py"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from faults.relay import Override
-from faults.stage import ORDERLY, faulty_policy, staged
+from faults.stage import faulty_policy, staged
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
@@ -109,18 +109,6 @@ def test_the_recording_is_what_happened(flown: Flown) -> None:
     assert list(logged_overrides(flown.recording / "link.tlog")) == flown.overrides
     frame_ids = set(back.frames["frame_id"].to_pylist())
     assert {tick.feature_frame_id for tick in rows} - {None} <= frame_ids
-
-
-def test_a_signal_gives_the_sticks_back(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
-        flying.start(*FLY, "--policy", "scripted:hover")
-        assert flying.relay.has_flown.wait(60)
-        flying.kill(signal.SIGTERM)
-        flying.kill(signal.SIGTERM)  # an impatient user
-        status, output = flying.end()
-    assert status in (*ORDERLY, 143), output  # 143: before the vehicle had left the ground
-    assert_released(flying.relay.overrides)
-    assert "Traceback" not in output
 
 
 def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:

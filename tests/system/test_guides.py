@@ -8,14 +8,14 @@ machine may be busy.
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from helpers.guides import ROOT, blocks, command_lines
-from mavbridge.core.processes import free_port
+from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
 
 pytestmark = pytest.mark.system
@@ -56,22 +56,12 @@ def here(words: Sequence[str], ports: dict[str, str], folder: Path) -> list[str]
     return [sys.executable, *rest]
 
 
-@contextmanager
-def running(command: Sequence[str]) -> Iterator[None]:
-    """A process beside the test, ended with the context."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait(TIMEOUT_S)
-
-
-def fly(vehicle: Sequence[str], terminals: Sequence[Sequence[str]]) -> str:
+def fly(vehicle: Sequence[str], terminals: Sequence[Sequence[str]], folder: Path) -> str:
     """What the last terminal printed; the others run beside it, and the vehicle."""
     with ExitStack() as stack:
-        for command in ([sys.executable, "-m", "sitl", *vehicle], *terminals[:-1]):
-            stack.enter_context(running(command))
+        beside = ([sys.executable, "-m", "sitl", *vehicle], *terminals[:-1])
+        for number, command in enumerate(beside):
+            stack.enter_context(running(*command, log=folder / f"{number}.log"))
         flight = subprocess.run(
             terminals[-1],
             stdin=subprocess.DEVNULL,
@@ -90,7 +80,8 @@ def fly_guide(
     output = ""
     for start in range(STARTS):
         recording = folder / str(start)
-        output = fly(vehicle, [here(words, ports, recording) for words in typed(page, firmware)])
+        terminals = [here(words, ports, recording) for words in typed(page, firmware)]
+        output = fly(vehicle, terminals, folder)
         if IN_CONTROL in output:
             return recording
     raise AssertionError(output)
