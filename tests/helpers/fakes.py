@@ -25,8 +25,6 @@ from mavbridge.core.vehicle import (
 )
 
 START_NS = 1_000 * NS_PER_S
-FOREVER_NS = 2**62
-"""``reset_ns`` of chunks for a guard that has to engage at once."""
 
 
 class FakeClock:

@@ -5,7 +5,7 @@ from typing import Any
 
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig, SetpointLimits
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.reasons import Code, Reason, Value
+from mavbridge.core.reasons import Code, Reason, Value, because
 from mavbridge.core.vehicle import (
     NEUTRAL,
     ActionKind,
@@ -16,7 +16,7 @@ from mavbridge.core.vehicle import (
     VehicleStatus,
 )
 from mavbridge.flight.settings import action_limits
-from mavbridge.guard.chunks import FreshnessLimits
+from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import ActionLimits, Smoothing
@@ -54,6 +54,8 @@ PX4_MODES = ModeRoles(
     needs_sticks_first=True,
 )
 STEP_NS = 10 * NS_PER_MS
+FOREVER_NS = 2**62
+"""``reset_ns`` of chunks for a guard that has to engage at once."""
 LINK = LinkConfig(connect="memory")
 
 _STATUS = VehicleStatus(
@@ -102,6 +104,10 @@ def altered(facts: EngagementInputs, **changes: Any) -> EngagementInputs:
 
 
 ON_GROUND = altered(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
+NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
+IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
+FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
+DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
 
 
 def stick_smoothing(
@@ -138,6 +144,26 @@ def flight_settings(**changes: Any) -> FlightSettings:
         "engagement": engagement_settings(modes=("ALT_HOLD",)),
     }
     return FlightSettings(**(settings | changes))
+
+
+def make_chunk(serial: int, solved_ns: int, *, age_ns: int = 0, **changes: Any) -> Chunk:
+    """Return a chunk, 20 ms a step, for a guard that may engage at once.
+
+    The vehicle's state is ``age_ns`` old at the end of the solve, the image 30 ms.
+    """
+    felt_ns = solved_ns - age_ns
+    chunk = Chunk(
+        serial=serial,
+        attitude_ns=felt_ns,
+        velocity_ns=felt_ns,
+        image_ns=solved_ns - 30 * NS_PER_MS,
+        computed_ns=solved_ns,
+        first_ns=felt_ns,
+        step_ns=20 * NS_PER_MS,
+        actions=(NEUTRAL,) * 16,
+        reset_ns=FOREVER_NS,
+    )
+    return chunk._replace(**changes)
 
 
 def codes(reason: Reason | None) -> tuple[Code, ...]:

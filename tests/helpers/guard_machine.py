@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from helpers.fakes import FOREVER_NS, START_NS, FakeClock, level_telemetry
+from helpers.fakes import START_NS, FakeClock, level_telemetry
 from helpers.flown_vehicle import FlownVehicle
-from helpers.guard_facts import engagement_settings, limits_of
+from helpers.guard_facts import engagement_settings, flight_settings, limits_of, make_chunk
 from helpers.wire import ARDUPILOT as CALIBRATION
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
@@ -25,7 +25,6 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.settings import FlightSettings
@@ -169,24 +168,19 @@ class GuardWorld:
 
     def _settings(self, meaning: ActionMeaning) -> FlightSettings:
         free = replace(limits_of(self.kind), change_per_s=(math.inf,) * 4)
-        return FlightSettings(
-            meaning=meaning,
-            stick_period_ns=STEP_NS,
-            chunk_period_ns=STEP_NS,
-            freshness=FreshnessLimits(
-                state_ns=LIMIT_NS, velocity_ns=LIMIT_NS, feature_ns=2 * LIMIT_NS, chunk_ns=LIMIT_NS
-            ),
-            smoothing=Smoothing(limits=free, tau_s=0.0),
-            envelope=EnvelopeLimits(),
-            watches_home_height=False,
-            watches_position=False,
-            engagement=engagement_settings(
-                modes=(self.mode,),
-                is_setpoint=self.kind != "sticks",
-                on_fault=self.on_fault,
-                then=self.then,
-                engage_channel=self.engage_channel,
-            ),
+        ages = FreshnessLimits(
+            state_ns=LIMIT_NS, velocity_ns=LIMIT_NS, feature_ns=2 * LIMIT_NS, chunk_ns=LIMIT_NS
+        )
+        engagement = engagement_settings(
+            modes=(self.mode,),
+            is_setpoint=self.kind != "sticks",
+            on_fault=self.on_fault,
+            then=self.then,
+            engage_channel=self.engage_channel,
+        )
+        smoothing = Smoothing(limits=free, tau_s=0.0)
+        return flight_settings(
+            meaning=meaning, freshness=ages, smoothing=smoothing, engagement=engagement
         )
 
     @property
@@ -211,18 +205,9 @@ class GuardWorld:
         action: Action = Sticks(0.1, 0.0, 0.2 + 0.0025 * (self.serial % CODES), 0.0)
         if self.kind == "velocity":
             action = Velocity(1.0 + 0.01 * (self.serial % CODES), 0.0, 0.0, 0.0)
-        fresh = Chunk(
-            serial=self.serial,
-            attitude_ns=now_ns - 5 * MS,
-            velocity_ns=now_ns - 5 * MS,
-            image_ns=now_ns - 30 * MS,
-            computed_ns=now_ns,
-            first_ns=now_ns,
-            step_ns=20 * MS,
-            actions=(action,) * HORIZON,
-            reset_ns=FOREVER_NS,
-        )
-        made = fresh._replace(**changes)
+        made = make_chunk(
+            self.serial, now_ns, age_ns=5 * MS, first_ns=now_ns, actions=(action,) * HORIZON
+        )._replace(**changes)
         self.chunks[self.serial % CODES] = made
         return made
 

@@ -119,19 +119,6 @@ def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     assert traces.deviation.most == 0
 
 
-def test_another_low_pass_moves_the_sticks() -> None:
-    source, steps = golden("numpy_px4"), through_gate("numpy_px4")
-    limits = replace(source.config.limits, tau=0.2)
-    config = replace(source.config, limits=limits)
-    frame = action_frame(source.contract)
-    chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
-
-    settings = recorded_plan(replace(source, config=config)).guard
-    traces = other_traces(steps, replay_other(steps, settings, chunks))
-
-    assert 0.005 < traces.deviation.most < 1
-
-
 def with_solve(source: ReplaySource, change: Callable[[Solve], Solve]) -> ReplaySource:
     middle = len(source.solves) // 2
     solves = list(source.solves)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from helpers.factories import make_plan, make_solve, make_trace
+from helpers.factories import make_guard_tick, make_plan, make_solve, make_trace
 from helpers.fakes import START_NS, ListSink, level_telemetry, samples_of, without
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.reasons import Code, because
@@ -18,7 +18,6 @@ from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     GuardError,
     GuardStatus,
-    GuardTick,
     Packets,
     Samples,
     encode_samples,
@@ -27,19 +26,16 @@ from policy.contract import Contract
 
 MS = NS_PER_MS
 STICKS = Sticks(0.2, 0.2, 0.2, 0.2)
-TICK = GuardTick(
+TICK = make_guard_tick(
+    START_NS,
     slot=4,
-    due_ns=START_NS,
-    woke_ns=START_NS,
-    decided_ns=START_NS,
-    sent_ns=START_NS + MS,
     missed_slots=1,
     is_coasting=True,
     chunk_serial=7,
+    sent_ns=START_NS + MS,
     trace=make_trace(STICKS),
     sent=STICKS,
     phase=Phase.FLYING,
-    reason=None,
 )
 WAIT = because(Code.NO_CHUNK)
 OFF = because(Code.OVERRIDE_SWITCH_OFF)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.guard_facts import codes
+from helpers.guard_facts import codes, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, BodyRates, Sticks
@@ -25,22 +25,13 @@ LIMITS = FreshnessLimits(
 )
 OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)
 NAN = Sticks(float("nan"), 0.0, 0.0, 0.0)
+RISING = tuple(Sticks(0.0, 0.0, 0.0, 0.05 * k) for k in range(16))
 
 
 def chunk(serial: int, computed_ms: int, **changes: object) -> Chunk:
     """Solved in 2 ms from an attitude 3 ms old; the roll stick rises by 1 per second."""
-    computed_ns = computed_ms * MS
-    made = Chunk(
-        serial=serial,
-        attitude_ns=computed_ns - 5 * MS,
-        velocity_ns=computed_ns - 5 * MS,
-        image_ns=computed_ns - 40 * MS,
-        computed_ns=computed_ns,
-        first_ns=computed_ns - 5 * MS,
-        step_ns=50 * MS,
-        actions=tuple(Sticks(0.0, 0.0, 0.0, 0.05 * k) for k in range(16)),
-    )
-    return made._replace(**changes)  # type: ignore[arg-type]
+    usual = {"image_ns": (computed_ms - 40) * MS, "step_ns": 50 * MS, "actions": RISING}
+    return make_chunk(serial, computed_ms * MS, age_ns=5 * MS, **usual | changes)
 
 
 def buffer(period_ms: int = 10, limits: FreshnessLimits = LIMITS) -> ChunkBuffer:

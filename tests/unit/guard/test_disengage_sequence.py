@@ -5,7 +5,18 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, Stepped, altered, flying
+from helpers.guard_facts import (
+    AIRBORNE,
+    COPTER_MODES,
+    DEATH,
+    FAULT,
+    IDLE_RECEIVER,
+    NO_RECEIVER,
+    PX4_MODES,
+    Stepped,
+    altered,
+    flying,
+)
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
@@ -14,12 +25,13 @@ from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
 IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
 MIDDLE = altered(AIRBORNE, pilot_sticks=CENTRED)
-IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
-NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
 PX4 = altered(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
-FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
 LOST = because(Code.VEHICLE_LOST, after_s=30)
 OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station")
+
+
+def throttle_at(position: float) -> Any:
+    return altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=position))
 
 
 def at_fault(facts: Any, **rules: Any) -> Stepped:
@@ -30,34 +42,54 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
 
 
 @pytest.mark.parametrize(
-    ("facts", "choice", "mode"),
+    ("facts", "rules", "mode"),
     [
-        (MIDDLE, "auto", None),
-        (altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-0.2)), "auto", None),
-        (altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=0.21)), "auto", "BRAKE"),
-        (IDLE_RECEIVER, "auto", "BRAKE"),
-        (NO_RECEIVER, "auto", "BRAKE"),
-        (altered(MIDDLE, has_receiver=False), "auto", "BRAKE"),
-        (altered(MIDDLE, has_receiver=None), "auto", "BRAKE"),
-        (altered(MIDDLE, is_position_valid=False), "auto", None),
-        (altered(MIDDLE, is_position_valid=False), "rtl", "RTL"),
-        (altered(NO_RECEIVER, is_position_valid=False), "auto", "LAND"),
-        (MIDDLE, "hold", "BRAKE"),
-        (MIDDLE, "land", "LAND"),
-        (MIDDLE, "rtl", "RTL"),
-        (NO_RECEIVER, "release", "BRAKE"),
-        (IDLE_RECEIVER, "release", "BRAKE"),
-        (altered(MIDDLE, is_receiver_sick=True), "release", "BRAKE"),
-        (altered(AIRBORNE, pilot_sticks=None), "auto", "BRAKE"),
-        (altered(IDLE_RECEIVER, is_landed=True), "auto", None),
-        (altered(IDLE_RECEIVER, is_landed=None), "auto", "BRAKE"),
-        (altered(NO_RECEIVER, is_landed=True), "auto", "BRAKE"),
-        (altered(NO_RECEIVER, is_landed=True), "release", None),
+        # after a fault
+        (MIDDLE, {"on_fault": "auto"}, None),
+        (throttle_at(-0.2), {"on_fault": "auto"}, None),
+        (throttle_at(0.21), {"on_fault": "auto"}, "BRAKE"),
+        (IDLE_RECEIVER, {"on_fault": "auto"}, "BRAKE"),
+        (NO_RECEIVER, {"on_fault": "auto"}, "BRAKE"),
+        (altered(MIDDLE, has_receiver=False), {"on_fault": "auto"}, "BRAKE"),
+        (altered(MIDDLE, has_receiver=None), {"on_fault": "auto"}, "BRAKE"),
+        (altered(MIDDLE, is_position_valid=False), {"on_fault": "auto"}, None),
+        (altered(MIDDLE, is_position_valid=False), {"on_fault": "rtl"}, "RTL"),
+        (altered(NO_RECEIVER, is_position_valid=False), {"on_fault": "auto"}, "LAND"),
+        (MIDDLE, {"on_fault": "hold"}, "BRAKE"),
+        (MIDDLE, {"on_fault": "land"}, "LAND"),
+        (MIDDLE, {"on_fault": "rtl"}, "RTL"),
+        (NO_RECEIVER, {"on_fault": "release"}, "BRAKE"),
+        (IDLE_RECEIVER, {"on_fault": "release"}, "BRAKE"),
+        (altered(MIDDLE, is_receiver_sick=True), {"on_fault": "release"}, "BRAKE"),
+        (altered(AIRBORNE, pilot_sticks=None), {"on_fault": "auto"}, "BRAKE"),
+        (altered(IDLE_RECEIVER, is_landed=True), {"on_fault": "auto"}, None),
+        (altered(IDLE_RECEIVER, is_landed=None), {"on_fault": "auto"}, "BRAKE"),
+        (altered(NO_RECEIVER, is_landed=True), {"on_fault": "auto"}, "BRAKE"),
+        (altered(NO_RECEIVER, is_landed=True), {"on_fault": "release"}, None),
+        (altered(AIRBORNE, mode="LOITER"), {"is_setpoint": True, "modes": ("LOITER",)}, "BRAKE"),
+        # at a normal end
+        (MIDDLE, {"then": "auto"}, None),
+        (IDLE_RECEIVER, {"then": "auto"}, "LAND"),
+        (IDLE_RECEIVER, {"then": "release"}, "LAND"),
+        (altered(IDLE_RECEIVER, is_landed=True), {"then": "auto"}, None),
+        (NO_RECEIVER, {"then": "auto"}, "LAND"),
+        (NO_RECEIVER, {"then": "release"}, "LAND"),
+        (MIDDLE, {"then": "rtl"}, "RTL"),
+        # where sticks do nothing, as in the autopilot's takeoff
+        (altered(AIRBORNE, mode="GUIDED"), {"then": "auto", "modes": ("GUIDED",)}, "BRAKE"),
+        (altered(AIRBORNE, mode="GUIDED"), {"then": "release", "modes": ("GUIDED",)}, "BRAKE"),
+        # of a policy that has stopped the vehicle, which is held before a hand gets it
+        (MIDDLE, {"then": "auto", "keeps_place": True}, "BRAKE"),
+        (MIDDLE, {"then": "release", "keeps_place": True}, None),
+        (MIDDLE, {"then": "land", "keeps_place": True}, "LAND"),
+        (NO_RECEIVER, {"then": "auto", "keeps_place": True}, "LAND"),
+        (MIDDLE, {"on_fault": "auto", "keeps_place": True}, None),
     ],
 )
-def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> None:
-    stepped = flying(facts, on_fault=choice)
-    assert stepped.step(**FAULT) == Actions(control=NEUTRAL, mode=mode)
+def test_the_mode_of_the_way_out(facts: Any, rules: Any, mode: str | None) -> None:
+    stepped = flying(facts, **rules)
+    move = stepped.step("release") if "then" in rules else stepped.step(**FAULT)
+    assert move == Actions(control=NEUTRAL, mode=mode)
 
 
 @pytest.mark.parametrize(
@@ -115,42 +147,6 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(
     moves = left_for_a_hand(held_by_px4(seconds), told_ns, **changes)
     assert {move.mode for move in moves} == {None}
     assert [move.control for move in moves].index(RELEASE) == waits
-
-
-@pytest.mark.parametrize(
-    ("facts", "choice", "mode"),
-    [
-        (MIDDLE, "auto", None),
-        (IDLE_RECEIVER, "auto", "LAND"),
-        (IDLE_RECEIVER, "release", "LAND"),
-        (altered(IDLE_RECEIVER, is_landed=True), "auto", None),
-        (NO_RECEIVER, "auto", "LAND"),
-        (NO_RECEIVER, "release", "LAND"),
-        (MIDDLE, "rtl", "RTL"),
-    ],
-)
-def test_the_mode_at_a_normal_end(facts: Any, choice: Any, mode: str | None) -> None:
-    stepped = flying(facts, then=choice)
-    assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
-
-
-@pytest.mark.parametrize(
-    ("facts", "choice", "mode"),
-    [
-        (MIDDLE, "auto", "BRAKE"),
-        (MIDDLE, "release", None),
-        (MIDDLE, "land", "LAND"),
-        (NO_RECEIVER, "auto", "LAND"),
-    ],
-)
-def test_a_vehicle_that_its_policy_stopped_is_held_before_a_hand_gets_it(
-    facts: Any, choice: Any, mode: str | None
-) -> None:
-    stepped = flying(facts, then=choice, keeps_place=True)
-    assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
-    if mode == "BRAKE":
-        assert RELEASE in {move.control for move in stepped.run(1.0, mode="BRAKE")}
-        assert flying(facts, keeps_place=True).step(**FAULT).mode is None, "it did not stop it"
 
 
 def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
@@ -229,7 +225,7 @@ def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(facts: Any) 
 
 def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     stepped = flying(NO_RECEIVER)
-    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    stepped.engagement.stop(DEATH)
     stepped.step()
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
@@ -238,8 +234,7 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
         assert {move.control for move in moves} == {NEUTRAL}
         stepped.run(1, heard_ns=None, mode_arrived_ns=None)
     stepped.run(33, heard_ns=stepped.facts.now_ns, mode_arrived_ns=stepped.facts.now_ns)
-    died = because(Code.FLIGHT_PROCESS_DIED)
-    assert stepped.engagement.reason == because(Code.THEN, first=died, then=LOST)
+    assert stepped.engagement.reason == because(Code.THEN, first=DEATH.reason, then=LOST)
     assert stepped.phase is Phase.ENDED
 
 
@@ -402,11 +397,6 @@ def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_
 
 
 GUIDED = altered(AIRBORNE, mode="GUIDED")
-
-
-def test_setpoints_end_in_a_mode_that_holds_also_where_sticks_would_do() -> None:
-    stepped = flying(altered(AIRBORNE, mode="LOITER"), is_setpoint=True, modes=("LOITER",))
-    assert stepped.step(**FAULT).mode == "BRAKE"
 
 
 @pytest.mark.parametrize(("is_landed", "hand"), [(True, IDLE), (False, NEUTRAL)])

@@ -8,7 +8,6 @@ import pytest
 from helpers.guard_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped, altered
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import OnFault
 from mavbridge.guard.sequences import FLOW_NS, EngageSequence
 from mavbridge.guard.values import (
     Actions,
@@ -77,57 +76,6 @@ def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter()
     assert stepped.phase is Phase.FLYING
 
 
-@pytest.mark.parametrize("choice", ["auto", "release"])
-def test_a_takeoff_that_is_broken_off_does_not_climb_on(choice: OnFault) -> None:
-    """The receiver's sticks, which a release would give it, do nothing in GUIDED."""
-    stepped = Stepped(
-        altered(GROUND, mode="GUIDED"),
-        arm=True,
-        takeoff_m=8.0,
-        then=choice,
-    )
-    stepped.run(0.1)
-    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
-    assert stepped.step("release") == Actions(control=NEUTRAL, mode="BRAKE")
-
-
-def entering_offboard() -> Stepped:
-    """By an act in the air; the mode has come, and the policy is late."""
-    facts = altered(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
-    stepped = Stepped(
-        facts,
-        is_setpoint=True,
-        modes=("OFFBOARD",),
-    )
-    stepped.step()
-    stepped.step("engage")
-    stepped.run(0.12)
-    assert "OFFBOARD" in [move.mode for move in stepped.moves]
-    stepped.step(
-        mode="OFFBOARD",
-        chunk_problem=because(Code.TOO_OLD, quantity="chunk", age_ms=300.0, limit_ms=100.0),
-    )
-    assert stepped.phase is Phase.PREPARING
-    return stepped
-
-
-def test_offboard_once_entered_is_kept_by_neutral_until_the_policy_is_ready() -> None:
-    stepped = entering_offboard()
-    assert {move.control for move in stepped.run(2.0)} == {NEUTRAL}
-    stepped.step(chunk_problem=None)
-    assert stepped.phase is Phase.FLYING
-
-
-def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
-    """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
-    stepped = Stepped(altered(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
-    stepped.run(0.1)
-    assert {move.control for move in stepped.run(0.1, problem=NO_ECHO)} == {None}
-    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, problem=None)
-    moves = stepped.run(1.0, problem=NO_ECHO)
-    assert {move.control for move in moves} == {NEUTRAL}
-
-
 # --- single steps, each condition by itself
 
 
@@ -174,6 +122,9 @@ IN_OFFBOARD = {"armed": True, "mode": "OFFBOARD", "modes": PX4_MODES}
         (GROUND, {}, ARMED, IDLE, [], None),
         (GROUND, {}, {**ARMED, "problem": NO_ECHO}, None, [], Code.NO_ECHO),
         (AIRBORNE, CLIMB, {"problem": NO_ECHO}, None, [], Code.NO_ECHO),
+        # Without a receiver silence would be a failsafe in the climb; on the ground it is none.
+        (IN_GUIDED, CLIMB, {"armed": True, "problem": NO_ECHO}, NEUTRAL, [], Code.NO_ECHO),
+        (IN_GUIDED, CLIMB, {"problem": NO_ECHO}, None, [], Code.NO_ECHO),
         (IN_GUIDED, CLIMB, {"armed": True}, NEUTRAL, ["climb 10"], Code.TAKING_OFF),
         (IN_GUIDED, CLIMB, {"armed": True, "is_landed": False}, NEUTRAL, [], Code.TAKING_OFF),
         (
@@ -195,6 +146,7 @@ IN_OFFBOARD = {"armed": True, "mode": "OFFBOARD", "modes": PX4_MODES}
             Code.WAITING_FOR_MODE,
         ),
         (LOITERING, SETPOINTS, {}, NEUTRAL, [], Code.WAITING_FOR_MODE),
+        (LOITERING, SETPOINTS, {"mode": "OFFBOARD"}, NEUTRAL, [], None),  # it is kept by them
         (altered(LOITERING, has_receiver=False), {"modes": ("AUTO.LOITER",)}, {}, None, [], None),
         (
             LOITERING,

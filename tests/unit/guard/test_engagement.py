@@ -8,6 +8,10 @@ import pytest
 
 from helpers.guard_facts import (
     AIRBORNE,
+    DEATH,
+    FAULT,
+    IDLE_RECEIVER,
+    NO_RECEIVER,
     ON_GROUND,
     PX4_MODES,
     Stepped,
@@ -16,21 +20,13 @@ from helpers.guard_facts import (
     flying,
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import NEUTRAL as CENTRED
+from mavbridge.core.reasons import Code, because
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest, Outcome, Phase
 
 NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
 RELEASE = Actions(control=ControlSource.RELEASE)
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
-NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
-FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
-DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
-
-
-def changed(before: str, after: str) -> Reason:
-    return because(Code.MODE_CHANGED, before=before, after=after)
 
 
 # --- the engage switch and the first arming
@@ -202,17 +198,6 @@ def test_the_duration_counts_from_the_first_engagement_on_and_through_takeovers(
 # --- what is told
 
 
-def test_the_reason_of_the_way_out_and_who_ended_it_are_both_told() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(0.2, mode="BRAKE", chunk_fault=None)
-    stepped.step(mode="LOITER")
-    first = FAULT["chunk_fault"]
-    assert stepped.engagement.reason == because(
-        Code.THEN, first=first, then=changed("BRAKE", "LOITER")
-    )
-
-
 def test_a_key_on_the_way_in_is_the_whole_reason_and_a_later_act_has_3_s() -> None:
     stepped = Stepped(altered(ON_GROUND, echo_confirmed=True), arm=True)
     stepped.run(0.1)
@@ -246,16 +231,6 @@ def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
         inputs=because(Code.NO_IMAGE),
     )
     assert stepped.engagement.outcome == (0, None, 0, False, None, None), "the policy never flew"
-
-
-def test_what_was_not_confirmed_is_told_once() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(3.1)
-    assert stepped.engagement.refusal == because(Code.MODE_NOT_CONFIRMED, mode="BRAKE")
-    stepped.engagement.refusal = None
-    stepped.run(1)
-    assert stepped.engagement.refusal is None
 
 
 def test_each_flight_and_how_it_ended_is_counted() -> None:
@@ -357,7 +332,6 @@ def test_watching_ends_as_a_flight_does(ends: str) -> None:
 
 
 NEUTRAL = ControlSource.NEUTRAL
-IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
 PX4 = altered(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
 FIRST_MS = (0, 20, 40, 100, 150, 200, 250)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from helpers.fakes import AIRBORNE_STATUS, FOREVER_NS, START_NS
+from helpers.fakes import AIRBORNE_STATUS, START_NS
 from helpers.guard_facts import (
     COPTER_MODES,
     PX4_MODES,
@@ -14,6 +14,7 @@ from helpers.guard_facts import (
     engagement_settings,
     flight_settings,
     limits_of,
+    make_chunk,
     stick_smoothing,
 )
 from mavbridge.core.clock import NS_PER_MS
@@ -82,17 +83,7 @@ class Stepped:
     def chunk(self, at_ms: float, sticks: Action = WANTED, *, actions: int = 16) -> Chunk:
         self.serial += 1
         now_ns = START_NS + round(at_ms * MS)
-        stamps = {"attitude_ns": now_ns - 3 * MS, "velocity_ns": now_ns - 3 * MS}
-        return Chunk(
-            serial=self.serial,
-            **stamps,
-            image_ns=now_ns - 30 * MS,
-            computed_ns=now_ns,
-            first_ns=now_ns - 3 * MS,
-            step_ns=20 * MS,
-            actions=(sticks,) * actions,
-            reset_ns=FOREVER_NS,
-        )
+        return make_chunk(self.serial, now_ns, age_ns=3 * MS, actions=(sticks,) * actions)
 
     def step(
         self,

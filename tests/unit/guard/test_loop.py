@@ -4,15 +4,14 @@ from typing import Any
 
 import pytest
 
-from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
-from helpers.guard_facts import flight_settings
+from helpers.fakes import START_NS, FakeClock, FakeLink
+from helpers.guard_facts import flight_settings, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
-    Action,
     Command,
     Sticks,
 )
@@ -77,27 +76,15 @@ class Rig:
         received = [encode_to_guard(message) for message in first or []]
         self.loop = GuardLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
         self.solves = True
-        self.wanted: Action = WANTED
         self.serial = 0
 
     def tell(self, *messages: ToGuard) -> None:
         self.port.inbox += [encode_to_guard(message) for message in messages]
 
-    def chunk(self, **changes: Any) -> Chunk:
+    def chunk(self) -> Chunk:
         self.serial += 1
-        now_ns = self.clock.now_ns()
-        chunk = Chunk(
-            serial=self.serial,
-            attitude_ns=now_ns,
-            velocity_ns=now_ns,
-            image_ns=now_ns,
-            computed_ns=now_ns,
-            first_ns=now_ns,
-            step_ns=50 * MS,
-            actions=(self.wanted,) * 4,
-            reset_ns=FOREVER_NS,
-        )
-        return chunk._replace(**changes)
+        now_ns, actions = self.clock.now_ns(), (WANTED,) * 4
+        return make_chunk(self.serial, now_ns, step_ns=50 * MS, actions=actions)
 
     def run(self, seconds: float) -> "Rig":
         until_ns = self.clock.now_ns() + round(seconds * NS_PER_S)

@@ -9,6 +9,9 @@ import pytest
 from benchmarks.safety_table import PAGE, with_table
 from helpers.guard_facts import (
     AIRBORNE,
+    DEATH,
+    IDLE_RECEIVER,
+    NO_RECEIVER,
     ON_GROUND,
     PX4_MODES,
     Stepped,
@@ -18,7 +21,6 @@ from helpers.guard_facts import (
 )
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.guard import engagement
 from mavbridge.guard.table import PROGRESS, TABLE, Transition
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
@@ -30,11 +32,8 @@ TILT = because(Code.BEYOND, quantity="tilt", value=70.0, limit=60.0, unit="deg")
 OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
 REBOOT = {"interruption": because(Code.REBOOTED)}
 RADIO_FAILSAFE = {"is_failsafe": True, "mode": "RTL"}
-DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
 SIGNAL = EndRequest(because(Code.SIGNAL))
 SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
-NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
-IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
 LANDS: dict[str, Any] = {"on_fault": "rtl", "then": "land"}
 OFFBOARD = altered(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 SETPOINTS: dict[str, Any] = {
