@@ -56,27 +56,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m faults", description=__doc__)
     add = parser.add_argument
     add("names", nargs="*", metavar="NAME", help="scenarios or groups (default: all)")
-    add("--list", action="store_true", help="print the catalogue")
-    add("--autopilot", choices=("ardupilot", "px4"), help="only with this firmware")
-    add("--receiver", choices=("idle", "mid", "none"), help="only with this receiver")
     add("--jobs", type=int, default=1, metavar="N", help="flights at once (default: 1)")
     add("--out", type=Path, metavar="FILE", help="write the page of results, in Markdown")
     soak_help = "instead, fly for N minutes with a random fault every few seconds; find leaks"
     add("--soak", type=float, metavar="N", help=soak_help)
-    add("--seed", type=int, default=0, metavar="N", help="of the order of a soak's faults")
     args = parser.parse_args(argv)
     # An exit by this signal also ends the processes of the current flight.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        return _soak(args.soak, args.seed) if args.soak else _fly_catalogue(args)
+        return _soak(args.soak) if args.soak else _fly_catalogue(args)
     except (UsageError, StageError) as error:
         print(f"faults: error: {error}", file=sys.stderr)
         return 2
 
 
-def _soak(minutes: float, seed: int) -> int:
+def _soak(minutes: float) -> int:
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        result = soak(minutes, seed, Path(folder), print)
+        result = soak(minutes, Path(folder), print)
     print(make_summary(result))
     return 1 if result.failures else 0
 
@@ -85,18 +81,13 @@ def _fly_catalogue(args: argparse.Namespace) -> int:
     catalogue = load_catalogue()
     known = set(catalogue) | {scenario.group for scenario in catalogue.values()}
     if unknown := sorted(set(args.names) - known):
-        raise UsageError(f"no fault {', '.join(unknown)}; --list names them")
+        raise UsageError(f"no fault {', '.join(unknown)}; there are {', '.join(catalogue)}")
     flights = [
         (scenario, variant)
         for scenario in catalogue.values()
         if not args.names or {scenario.name, scenario.group} & set(args.names)
         for variant in scenario.variants
-        if args.autopilot in (None, variant.autopilot) and args.receiver in (None, variant.receiver)
     ]
-    if args.list:
-        for scenario in dict.fromkeys(scenario.name for scenario, _ in flights):
-            print(f"{catalogue[scenario].group:8s} {scenario:24s} {catalogue[scenario].what}")
-        return 0
     verdicts: list[Verdict] = []
     with ProcessPoolExecutor(args.jobs) as pool:
         futures = [pool.submit(_fly, scenario.name, variant) for scenario, variant in flights]

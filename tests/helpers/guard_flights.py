@@ -341,17 +341,13 @@ class GuardFlight:
         found = [(at_ns, m) for at_ns, data in self.up.sent for m in end.read(data)]
         return [(at_ns, m) for at_ns, m in found if at_ns >= since_ns]
 
-    def commands(self, number: int, since_ns: int = 0) -> list[tuple[float, ...]]:
-        """Return parameters 1 and 2 of every sent COMMAND_LONG of this number."""
-        return [
-            (m.param1, m.param2)
-            for _, m in self.left(since_ns)
-            if m.get_type() == "COMMAND_LONG" and m.command == number
-        ]
-
     def modes_asked(self, since_ns: int = 0) -> list[int]:
         """Numbers of the requested modes."""
-        return [int(mode) for _, mode in self.commands(dialect.MAV_CMD_DO_SET_MODE, since_ns)]
+        return [
+            int(m.param2)
+            for _, m in self.left(since_ns)
+            if m.get_type() == "COMMAND_LONG" and m.command == dialect.MAV_CMD_DO_SET_MODE
+        ]
 
     def sticks_sent(self, since_ns: int = 0) -> list[tuple[int, Sticks]]:
         """Sent overrides as sticks, without releases."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
-from helpers.pilots import pursuit, single_rate, steady
+from helpers.pilots import single_rate, steady
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -17,12 +17,12 @@ from mavbridge.core.records import Tick
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.network import MemoryTransport
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
 from mavbridge.simulation.world import Exposure
 from policy.contract import FloatArray
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner
+from sitl.pilot.demonstrator import Expert
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
@@ -145,32 +145,11 @@ def test_a_policy_that_looks_at_more_sees_a_larger_camera() -> None:
     assert {vision.rgb.shape for vision in sink.visions} == {(256, 256, 3)}
 
 
-def test_the_same_seed_sends_the_same_bytes_and_another_one_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sent: list[bytes] = []
-    send = MemoryTransport.send
-    monkeypatch.setattr(
-        MemoryTransport,
-        "send",
-        lambda self, data, peer: (sent.append(data), send(self, data, peer))[1],
-    )
-
-    def stick_bytes(seed: int) -> list[bytes]:
-        sent.clear()
-        one = flight(seed=seed)
-        one.fly(pursuit(one), max_time_s=2.0)
-        return list(sent)
-
-    first = stick_bytes(seed=1)
-    assert len(first) > 300
-    assert stick_bytes(seed=1) == first
-    assert stick_bytes(seed=2) != first
-
-
 def test_a_pilot_with_the_true_state_flies_all_gates() -> None:
     one = flight(course_seed=1_000_003)
-    result = one.fly(pursuit(one), max_time_s=60.0)
+    expert = Expert(one.course, 3.0, params=one.vehicle.params)
+    pilot = steady(lambda: expert.sticks(one.vehicle.ap.truth, one.clock.now_ns() / NS_PER_S))
+    result = one.fly(pilot, max_time_s=60.0)
     assert result.outcome == "finished"
     assert result.gates_passed == result.gates_total == 8
     assert list(result.gate_times_s) == sorted(result.gate_times_s)

@@ -179,13 +179,6 @@ def test_what_has_not_changed_is_not_sent_between_slots() -> None:
     assert [guard.step(30 + k).decision for k in range(1, 10)] == [None] * 9
 
 
-def test_the_fifth_unusable_chunk_ends_the_flight_as_it_comes() -> None:
-    guard = Stepped().engaged()
-    nan = WANTED._replace(roll=float("nan"))
-    phases = [guard.step(31 + k, guard.chunk(31 + k, nan)).tick.phase for k in range(5)]
-    assert phases == [Phase.FLYING] * 4 + [Phase.LEAVING]
-
-
 def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
     guard = Stepped()
     for at_ms in (0, 10, 20):
