@@ -26,111 +26,84 @@ from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest
 
 NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
 RELEASE = Actions(control=ControlSource.RELEASE)
-LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 
 
 # --- the engage switch and the first arming
 
 
-def switched(us: int = 1000, **changes: Any) -> Stepped:
-    return Stepped(
-        altered(AIRBORNE, rc_channels_us=(1500,) * 7 + (us,), **changes), engage_channel=8
-    )
+def put(us: int, **lost: Any) -> dict[str, Any]:
+    """The switch of channel 8 stands so, by a receiver that is well but for these facts."""
+    well = {"is_failsafe": False, "is_receiver_sick": False, "channels_arrived_ns": None}
+    return {"rc_channels_us": (1500,) * 7 + (us,), **well, **lost}
 
 
-def test_the_switch_engages_by_going_high_after_a_rest_and_releases_by_going_low() -> None:
-    stepped = switched(2000)
-    assert set(stepped.run(1)) == {NOTHING}  # it was high from the start
-    stepped.run(2, rc_channels_us=LOW)
+LOW, HIGH = put(1000), put(2000)
+LOST = (
+    put(1000, is_failsafe=True),
+    put(1000, is_receiver_sick=True),
+    put(1000, rc_channels_us=()),
+    put(1000, channels_arrived_ns=1),
+)
+NO_READINGS = (0, 799, 2201, 65535)
+BY_HAND = (
+    [(0.3, put(1199)), (0.3, put(1801))],
+    [(0.3, put(800)), (0.3, put(2200))],
+    [(1.0, HIGH), (2.0, LOW), (0.21, HIGH)],
+)
+NOT_BY_HAND = (
+    [(1.0, HIGH)],  # from the start
+    *([(0.3, put(us)), (0.3, put(1801))] for us in (1200, *NO_READINGS)),
+    *([(0.3, put(1199)), (0.3, put(us))] for us in (1800, *NO_READINGS)),
+    # a gap of readings is no rest
+    *([(3.0, before), (3.0, put(us)), (1.0, HIGH)] for before in (LOW, HIGH) for us in NO_READINGS),
+    # nor is a dropout that puts the switch low, in flight or before
+    *([(1.0, HIGH), (s, LOW), (2.0, HIGH)] for s in (0.02, 0.6, 1.5, 1.7)),
+    *(
+        [(1.0, HIGH), (0.01, {"act": "engage"}), (s, LOW), (2.0, HIGH)]
+        for s in (0.02, 0.6, 1.5, 1.7)
+    ),
+    # a receiver that was lost has to show it low again
+    *(
+        [(3.0, LOW), (0.6, lost), (again_s, LOW), (1.0, HIGH)]
+        for lost in LOST
+        for again_s in (0.0, 0.3, 1.7)
+    ),
+    [(3.0, LOW), (0.2, HIGH), (0.01, put(2000, is_receiver_sick=True))],
+    # arrivals count, and not the time for which an old value stays
+    [(0.45, put(1000, channels_arrived_ns=0)), (0.45, put(2000, channels_arrived_ns=450_000_000))],
+)
+
+
+@pytest.mark.parametrize("history", BY_HAND)
+def test_the_switch_engages_by_going_high_after_a_rest_and_releases_by_going_low(
+    history: Any,
+) -> None:
+    stepped = Stepped(engage_channel=8)
+    for seconds, changes in history:
+        stepped.run(seconds, **changes)
+    assert stepped.phase is Phase.FLYING
     assert stepped.engagement.refusal is None
-    assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == FLIES
-    assert stepped.engagement.refusal is None
-    assert stepped.step(rc_channels_us=LOW) == RELEASE
+    assert stepped.step(**LOW) == RELEASE, "low is taken at its word"
     assert stepped.codes == (Code.ENGAGE_SWITCH_OFF,)
 
 
-@pytest.mark.parametrize(
-    ("low_us", "high_us", "engages"),
-    [
-        (1199, 1801, True),
-        (800, 2200, True),
-        (799, 1801, False),  # no reading of a radio
-        (1199, 2201, False),
-        (1200, 1801, False),
-        (1199, 1800, False),
-        (0, 2000, False),  # a channel that the receiver does not have
-        (65535, 2000, False),
-    ],
-)
-def test_the_switch_engages_from_below_1200_to_above_1800(
-    low_us: int, high_us: int, engages: bool
-) -> None:
-    stepped = Stepped(altered(AIRBORNE, rc_channels_us=(low_us,)), engage_channel=1)
-    stepped.run(0.3)
-    stepped.run(0.3, rc_channels_us=(high_us,))
-    assert (stepped.phase is Phase.FLYING) == engages
+@pytest.mark.parametrize("history", NOT_BY_HAND)
+def test_what_looks_like_a_hand_on_the_switch_engages_nothing_and_a_hand_does(history: Any) -> None:
+    stepped = Stepped(engage_channel=8)
+    for seconds, changes in history:
+        stepped.run(seconds, **changes)
+    assert stepped.phase is not Phase.FLYING
+    stepped.run(2.0, **LOW)
+    stepped.run(0.3, **HIGH)
+    assert stepped.phase is Phase.FLYING
 
 
-@pytest.mark.parametrize("unused_us", [0, 799, 2201, 65535])
-@pytest.mark.parametrize("before", [LOW, HIGH])
-def test_a_gap_of_readings_is_no_rest(unused_us: int, before: tuple[int, ...]) -> None:
-    stepped = Stepped(altered(AIRBORNE, rc_channels_us=before), engage_channel=8)
-    stepped.run(3)
-    assert set(stepped.run(3, rc_channels_us=(*HIGH[:7], unused_us))) == {NOTHING}
-    assert set(stepped.run(1, rc_channels_us=HIGH)) == {NOTHING}
-    stepped.run(2, rc_channels_us=LOW)
-    assert FLIES in stepped.run(0.3, rc_channels_us=HIGH)
-
-
-@pytest.mark.parametrize("seconds", [0.02, 0.6, 1.5, 1.7])
-@pytest.mark.parametrize("is_flying", [False, True])
-def test_a_dropout_that_puts_the_switch_low_is_no_act(seconds: float, is_flying: bool) -> None:
-    stepped = switched(2000)
-    stepped.run(1)
-    if is_flying:
-        stepped.step("engage")
-    first, *rest = stepped.run(seconds, rc_channels_us=LOW)
-    assert first == (RELEASE if is_flying else NOTHING), "low is taken at its word"
-    assert FLIES not in (*rest, *stepped.run(2, rc_channels_us=HIGH))
-
-
-@pytest.mark.parametrize(
-    "lost",
-    [
-        {"is_failsafe": True},
-        {"is_receiver_sick": True},
-        {"rc_channels_us": ()},
-        {"rc_channels_us": LOW, "channels_arrived_ns": 1},
-    ],
-)
-@pytest.mark.parametrize("again_s", [0.0, 0.3, 1.7])
-def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
-    lost: dict[str, Any], again_s: float
-) -> None:
-    stepped = switched()
-    stepped.run(3)
-    stepped.run(0.6, **lost)
-    well = {"is_failsafe": False, "is_receiver_sick": False, "channels_arrived_ns": None}
-    stepped.run(again_s, rc_channels_us=LOW, **well)
-    assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
+def test_a_switch_that_has_not_rested_is_told() -> None:
+    stepped = Stepped(engage_channel=8)
+    for seconds, changes in ((3.0, LOW), (0.6, LOST[0]), (1.7, LOW), (1.0, HIGH)):
+        stepped.run(seconds, **changes)
     not_rested = because(Code.SWITCH_NOT_RESTED, channel=8, rest_s=1.8)
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=not_rested)
-    stepped.run(2, rc_channels_us=LOW)
-    assert FLIES in stepped.run(0.3, rc_channels_us=HIGH)
-
-
-def test_a_receiver_that_is_sick_as_the_switch_goes_high_engages_nothing() -> None:
-    stepped = switched()
-    stepped.run(3)
-    stepped.run(0.2, rc_channels_us=HIGH)
-    assert stepped.step(is_receiver_sick=True) == NOTHING
-
-
-def test_the_dwell_counts_arrivals_and_not_the_time_that_an_old_value_stays() -> None:
-    stepped = switched(channels_arrived_ns=0)
-    stepped.run(0.45)
-    now_ns = stepped.facts.now_ns
-    assert set(stepped.run(0.45, rc_channels_us=HIGH, channels_arrived_ns=now_ns)) == {NOTHING}
 
 
 def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
