@@ -5,7 +5,6 @@ a fresh feature. A test moves the pilot's sticks, breaks the link, and reads the
 record and the sent bytes.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -50,7 +49,6 @@ ALOFT = AirborneStart(
     next_gate=0,
 )
 SIGNAL = because(Code.SIGNAL)
-NAN = (math.nan,) * 4
 HOVER = (0.0, 0.0, 0.0, 0.0)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
 Policy = Callable[[float], tuple[float, float, float, float]]
@@ -69,16 +67,6 @@ def leaning(_: float) -> tuple[float, float, float, float]:
 def climbing_first(t_s: float) -> tuple[float, float, float, float]:
     """Climb from the ground to some 4 m, then hover with a lean."""
     return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
-
-
-class StoppableStepper(GuardStepper):
-    """Guard that can stand still, as under SIGSTOP."""
-
-    is_stopped = False
-
-    def step(self) -> None:
-        if not self.is_stopped:
-            super().step()
 
 
 class GuardFlight:
@@ -156,8 +144,7 @@ class GuardFlight:
         receive = flight_process(
             self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
         )
-        stepper = StoppableStepper(self.clock, self.guard)
-        self.guard_stepper = stepper
+        stepper = GuardStepper(self.clock, self.guard)
         to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else receive()
         to_guard.on_arrival = self.down.on_arrival = stepper.step
         self._wake = stepper.step
@@ -212,13 +199,6 @@ class GuardFlight:
         for after_ns, packet in words.packets:
             at_ns = self.clock.now_ns() + 2 * MS + after_ns
             self.clock.schedule(at_ns, partial(self.up.send, packet))
-
-    def stand_still(self, seconds: float) -> None:
-        """Stop both processes, as in a long stall of the machine, and continue."""
-        self.is_flight_process_stopped = self.guard_stepper.is_stopped = True
-        self.run(seconds)
-        self.is_flight_process_stopped = self.guard_stepper.is_stopped = False
-        self._wake()
 
     # --- time
 

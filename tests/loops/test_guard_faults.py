@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.guard_facts import figures
-from helpers.guard_flights import CONTRACT, HOVER, MS, GuardFlight
+from helpers.guard_flights import CONTRACT, HOVER, MS, GuardFlight, leaning
 from mavbridge.config.flight import EnvelopeConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
@@ -19,6 +19,7 @@ from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.flight.settings import TAU_S
 from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
+from sitl.vehicle.config import IDLE_RECEIVER_US
 
 # --- slow policies, which play each chunk for long
 
@@ -125,3 +126,24 @@ def test_a_landing_under_the_policy_is_a_normal_end() -> None:
 
     assert flight.codes == (Code.LANDED,)
     assert not flight.modes_asked()
+
+
+@pytest.mark.parametrize(
+    ("end", "mode"), [(GuardFlight.die, Mode.BRAKE), (GuardFlight.stop, Mode.LAND)]
+)
+def test_over_an_idle_receiver_no_ending_lets_the_vehicle_fall(
+    end: Callable[[GuardFlight], None], mode: Mode
+) -> None:
+    """The catalogue of faults judges every ending so, with every receiver, in real time."""
+    flight = GuardFlight(leaning).launch()
+    flight.receiver(ch3=IDLE_RECEIVER_US[2])
+    flight.run(0.2)
+    flight.act("engage")
+    flight.run(1.2)
+    assert flight.phase is Phase.FLYING, flight.describe()
+    end(flight)
+    height_m = flight.height_m
+    flight.run(10)
+    assert flight.ap.mode is mode, flight.describe()
+    assert mode is Mode.LAND or height_m - flight.height_m < 2.0
+    assert flight.vehicle.log.summary(flight.ap)["impact_speed_mps"] <= 1.0

@@ -25,6 +25,7 @@ LIMITS = FreshnessLimits(
 )
 OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)
 NAN = Sticks(float("nan"), 0.0, 0.0, 0.0)
+SHORT: dict[str, object] = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}  # acts for 35 ms
 RISING = tuple(Sticks(0.0, 0.0, 0.0, 0.05 * k) for k in range(16))
 
 
@@ -127,13 +128,11 @@ def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
 
 
 def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
-    short = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}
     for latency_ms, is_covered in ((5, True), (25, False)):
         held = buffer(33)
         for serial, now_ms in enumerate(range(1000, 1166, 33), start=1):
-            held.offer(
-                chunk(serial, now_ms, first_ns=(now_ms - latency_ms) * MS, **short), now_ms * MS
-            )
+            first_ns = (now_ms - latency_ms) * MS
+            held.offer(chunk(serial, now_ms, first_ns=first_ns, **SHORT), now_ms * MS)
         assert (held.problem(now_ms * MS) is None) == is_covered
         assert held.impossibility is None, "the solves may become faster"
 
@@ -254,14 +253,6 @@ def test_the_grace_is_100_ms_or_three_periods(period_ms: int, grace_ms: int) -> 
     assert buffer(period_ms).grace_ns == grace_ms * MS
 
 
-def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -> None:
-    slow = buffer(500)
-    for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
-        slow.offer(chunk(serial, now_ms), now_ms * MS)
-    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_BEYOND_PLAN,)
-    assert figures(slow.problem(2000 * MS), "gap_ms", "bridged_ms") == (500, 195)
-
-
 @pytest.mark.parametrize(
     ("refusal", "heard_ms", "until_ms"),
     [
@@ -291,10 +282,9 @@ def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_
 
 
 def test_a_chunk_that_comes_just_as_the_last_one_ends_makes_up_for_a_gap_before_that() -> None:
-    short: dict[str, object] = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}
-    held = holding(**short)  # until 1035 ms
-    held.offer(chunk(2, 1085, **short), 1085 * MS)
-    held.offer(chunk(3, 1120, **short), 1120 * MS)
+    held = holding(**SHORT)  # until 1035 ms
+    held.offer(chunk(2, 1085, **SHORT), 1085 * MS)
+    held.offer(chunk(3, 1120, **SHORT), 1120 * MS)
     assert held.fault(1220 * MS) is None
 
 
@@ -313,17 +303,11 @@ def test_a_second_stall_is_flown_through_only_after_eight_chunks_in_time() -> No
         now_ms += 100
 
 
-def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> None:
-    held = buffer(10, STALL)
-    for serial, now_ms in enumerate((1000, 1250, 1500), start=1):
-        held.offer(chunk(serial, now_ms), now_ms * MS)
-    assert codes(held.problem(1500 * MS)) == (Code.CHUNKS_APART,)
-    assert figures(held.problem(1500 * MS), "gap_ms", "bridged_ms") == (250, 100)
-
-
-def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer, int]:
+def began(
+    period_ms: int, *gaps_ms: int, limits: FreshnessLimits = LIMITS, **changes: object
+) -> tuple[ChunkBuffer, int]:
     """A buffer with chunks so far apart, the newest with changes, and the moment that it came."""
-    held, now_ms = buffer(period_ms), 1000
+    held, now_ms = buffer(period_ms, limits), 1000
     held.offer(chunk(1, now_ms), now_ms * MS)
     for serial, gap_ms in enumerate(gaps_ms, start=2):
         now_ms += gap_ms
@@ -332,23 +316,41 @@ def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer
     return held, now_ms * MS
 
 
-def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
-    for gaps_ms in ((), (10,)):
-        held, now_ns = began(10, *gaps_ms)
-        assert held.problem(now_ns) == because(Code.JUST_BEGUN)
-    held, now_ns = began(10, 100, 10)  # as far apart as is bridged
-    assert held.problem(now_ns) is None
+def apart(gap_ms: int, bridged_ms: int, code: Code = Code.CHUNKS_APART) -> Reason:
+    return because(code, gap_ms=gap_ms, bridged_ms=bridged_ms)
 
 
-@pytest.mark.parametrize("gaps_ms", [(101, 10), (10, 101)])
-def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple[int, ...]) -> None:
-    held, now_ns = began(10, *gaps_ms)
-    assert codes(held.problem(now_ns)) == (Code.CHUNKS_APART,)
-    assert figures(held.problem(now_ns), "gap_ms", "bridged_ms") == (101, 100)
-    for serial in range(4, 11):  # the eighth gap after it forgets it
-        now_ns += 10 * MS
-        held.offer(chunk(serial, now_ns // MS), now_ns)
-    assert (held.problem(now_ns) is None) == (gaps_ms[0] == 101)
+TOO_SHORT = because(
+    Code.HORIZON_TOO_SHORT, covered_ms=35, gap_ms=60, horizon_ms=40, steps=2, step_ms=20
+)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "limits", "gaps_ms", "newest", "reason"),
+    [
+        (10, LIMITS, (), {}, because(Code.JUST_BEGUN)),
+        (10, LIMITS, (10,), {}, because(Code.JUST_BEGUN)),
+        (10, LIMITS, (100, 10), {}, None),  # as far apart as is bridged
+        (10, LIMITS, (101, 10), {}, apart(101, 100)),
+        (10, LIMITS, (10, 101), {}, apart(101, 100)),
+        (10, LIMITS, (101, *[10] * 8), {}, None),  # the eighth gap after it forgets it
+        (10, LIMITS, (101, *[10] * 7), {}, apart(101, 100)),
+        (10, LIMITS, (10, 60), SHORT, None),
+        (10, LIMITS, (10, 35, 35), SHORT, None),
+        (10, LIMITS, (10, 60, 60), SHORT, TOO_SHORT),  # most end before the next one
+        (10, STALL, (250, 250), {}, apart(250, 100)),  # as seldom as a stall
+        (500, LIMITS, (500, 500), {}, apart(500, 195, Code.CHUNKS_BEYOND_PLAN)),
+    ],
+)
+def test_a_flight_may_begin_after_three_chunks_in_time(
+    period_ms: int,
+    limits: FreshnessLimits,
+    gaps_ms: tuple[int, ...],
+    newest: dict[str, object],
+    reason: Reason | None,
+) -> None:
+    held, now_ns = began(period_ms, *gaps_ms, limits=limits, **newest)
+    assert held.problem(now_ns) == reason
 
 
 def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_are_longer() -> (
@@ -357,17 +359,6 @@ def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_
     held, now_ns = began(10, 10, 10, attitude_ns=1020 * MS)
     assert held.problem(now_ns + 100 * MS) is None
     assert held.problem(now_ns + 100 * MS + 1) == because(Code.NO_CHUNK)
-
-
-def test_chunks_that_mostly_end_before_the_next_one_begin_no_flight() -> None:
-    short: dict[str, object] = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}  # 35 ms are left
-    for gaps_ms in ((10, 60), (10, 35, 35)):
-        held, now_ns = began(10, *gaps_ms, **short)
-        assert held.problem(now_ns) is None
-    held, now_ns = began(10, 10, 60, 60, **short)
-    assert held.problem(now_ns) == because(
-        Code.HORIZON_TOO_SHORT, covered_ms=35, gap_ms=60, horizon_ms=40, steps=2, step_ms=20
-    )
 
 
 @EACH_AGE
