@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from helpers.guard_flights import GuardFlight, climbing_first, hovering, leaning
+from helpers.guard_flights import GuardFlight, climbing_first, hovering
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.values import Phase
@@ -25,14 +25,6 @@ def by_radio(flight: GuardFlight) -> None:
     flight.receiver(ch5=1680)  # FLTMODE5: LOITER
 
 
-def by_disarming(flight: GuardFlight) -> None:
-    flight.ap.disarm(force=True)
-
-
-def by_failsafe(flight: GuardFlight) -> None:
-    flight.ap.gcs_failsafe.active = True
-
-
 def by_switch(flight: GuardFlight) -> None:
     flight.receiver(ch8=1000)
 
@@ -44,8 +36,6 @@ def by_joystick(flight: GuardFlight) -> None:
 TAKEOVERS = [
     (by_mode, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.03),
     (by_radio, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.25),
-    (by_disarming, because(Code.DISARMED), 0.12),
-    (by_failsafe, because(Code.FAILSAFE, mode="ALT_HOLD"), 0.12),
     (by_switch, because(Code.OVERRIDE_SWITCH_OFF), 0.12),
     (
         by_joystick,
@@ -80,12 +70,9 @@ def test_a_takeover_releases_and_no_mode_command_ever_leaves(
 
 
 @pytest.mark.parametrize("rate_hz", [10, 50, 200])
-@pytest.mark.parametrize("policy", [hovering, leaning])
-def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(
-    rate_hz: float, policy: Callable[[float], tuple[float, float, float, float]]
-) -> None:
+def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(rate_hz: float) -> None:
     """At 10 Hz within three of its packets: each is shown for a third of a send period only."""
-    flight = GuardFlight(policy).fly()
+    flight = GuardFlight(hovering).fly()
     flight.joystick(rate_hz, (1700, 1450, 1600, 1500))
     took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
 
