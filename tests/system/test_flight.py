@@ -111,27 +111,23 @@ def test_the_recording_is_what_happened(flown: Flown) -> None:
     assert {tick.feature_frame_id for tick in rows} - {None} <= frame_ids
 
 
-def test_the_shipped_policy_runs_both_loops(tmp_path: Path) -> None:
+def test_readonly_runs_both_loops_or_one_after_a_warning_and_sends_nothing(tmp_path: Path) -> None:
     with staged(tmp_path) as flying:
         status, output = flying.fly("--dual-rate", "--readonly", "--duration", "2")
-    assert status == 0, output
-    report = flying.report()
-    assert report["mode"] == "dual"
-    assert report["engine"].startswith("openvino")
-    assert report["action"]["predict_ms"]["p50"] > 0
-    assert report["vision"]["encode_ms"]["p50"] > 0
-    assert flying.relay.overrides == []
-
-
-def test_a_policy_without_a_fast_path_flies_single_rate_after_a_warning(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
+        assert status == 0, output
+        shipped = flying.report()
         flags = ("--policy", faulty_policy("SingleRate"), "--dual-rate", "--readonly")
         status, output = flying.fly(*flags, "--duration", "1")
     assert status == 0, output
-    report = flying.report()
-    assert report["mode"] == "single"
-    assert report["action"]["target_hz"] == 30
+    assert shipped["mode"] == "dual"
+    assert shipped["engine"].startswith("openvino")
+    assert shipped["action"]["predict_ms"]["p50"] > 0
+    assert shipped["vision"]["encode_ms"]["p50"] > 0
+    without_fast_path = flying.report()
+    assert without_fast_path["mode"] == "single"
+    assert without_fast_path["action"]["target_hz"] == 30
     assert "single-rate" in output
+    assert flying.relay.overrides == []
 
 
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
