@@ -12,7 +12,7 @@ import json
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
@@ -62,6 +62,8 @@ def work_folder(settings: RunSettings) -> Iterator[Path]:
         raise TrainingError(f"{folder}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(folder / "data", ignore_errors=True)
+        with suppress(OSError):  # it holds a log, unless the run was refused
+            folder.rmdir()
 
 
 class TrainingRun(ABC, Generic[M, B]):

@@ -133,8 +133,10 @@ def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_p
     trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
     assert terms == {name: getattr(trained, name) for name in terms}
     other = TogeConfig(backbone="resnet50", contract=CONTRACT)
+    refused = replace(further, out=tmp_path / "refused.safetensors")
     with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
-        run(flights[:2], further, network=other)
+        run(flights[:2], refused, network=other)
+    assert not refused.work_folder.exists()
     by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
     with pytest.raises(PolicyError, match="flies by sticks, these flights were flown by rates"):
         run(flights[:2], further, network=by_rates)
