@@ -53,8 +53,12 @@ class FramePublisher:
     def path(self) -> Path:
         return self._path
 
-    def publish(self, rgb: NDArray[np.uint8 | np.uint16], captured_ns: int) -> None:
+    def publish(
+        self, rgb: NDArray[np.uint8 | np.uint16], captured_ns: int, *, is_whole: bool = True
+    ) -> None:
         """Publish a frame, [height, width, 3] uint8 or [height, width] uint16, as the newest.
+
+        ``is_whole=False`` leaves it marked as being written, like a writer that stopped halfway.
 
         Raises:
             ValueError: the shape or type is not the announced one, or the publisher is closed.
@@ -71,7 +75,7 @@ class FramePublisher:
         fields[CAPTURED_NS] = captured_ns
         self._pixels[self._frame_id % SLOTS][:] = rgb
         self._memory_barrier()
-        fields[SEQ] += 1
+        fields[SEQ] += is_whole
         self._memory_barrier()
         self._header[NEWEST] = self._frame_id
 

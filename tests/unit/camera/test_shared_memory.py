@@ -82,8 +82,7 @@ def test_the_newest_frame_wins_with_its_stamp_and_the_skipped_are_counted(camera
 
 
 def test_a_half_written_frame_is_waited_for(camera, writer, clock):
-    writer.publish(grey(3), START_NS)
-    writer._fields[1][SEQ] = 1
+    writer.publish(grey(3), START_NS, is_whole=False)
     assert camera.read(0) is None
 
     def finish():

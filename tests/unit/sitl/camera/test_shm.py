@@ -58,3 +58,14 @@ def test_close_marks_the_stream_as_closed_and_removes_the_name(name):
     assert not Path("/dev/shm", name).exists()
     with pytest.raises(ValueError, match="after close"):
         publisher.publish(grey(0), captured_ns=1)
+
+
+def test_frames_that_are_not_whole_stay_marked_as_being_written(publisher, name):
+    for number in range(1, 6):  # the fifth is in the slot of the first again
+        publisher.publish(grey(number), number, is_whole=False)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
+    assert sequence == 1
+    for number in range(6, 10):
+        publisher.publish(grey(number), number)
+    (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
+    assert sequence == 2
