@@ -319,7 +319,7 @@ def with_config(
     Args:
         tokens: the rest of the command line.
         config: TOML file of flags and further settings; the command line wins.
-        set_config: SECTION.KEY=VALUE: one setting, as limits.stall=0.2; repeatable.
+        set_config: SECTION.NAME=VALUE: one setting, as limits.stall=0.2; repeatable.
         print_config: Print all settings of the command as TOML, and exit.
         trust_config: Let --config name programs, other computers and outside folders.
         verbose: Show details: engine, vehicle, streams, parameters.
