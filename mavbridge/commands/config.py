@@ -38,7 +38,7 @@ class ContractConfig:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ExportPolicyConfig:
-    """What is written, and where."""
+    """Policy to export, and the folder for its files."""
 
     out: Path
     """Folder for encoder.onnx, denoiser.onnx and policy.json."""
@@ -181,7 +181,7 @@ class ImagineConfig(Ranged):
 @Parameter(name="*", group=OUTPUT)
 @dataclass(frozen=True, kw_only=True)
 class InspectConfig:
-    """What is made of recorded flights, besides the tables on the terminal."""
+    """Output of an inspection besides its tables on the terminal."""
 
     html: Path | None = None
     """Write one page with the plots, the path, the worst moments and the video in it."""
@@ -242,7 +242,7 @@ ReplayFrom = Literal["auto", "chunks", "features", "video"]
 @Parameter(name="*", group=OUTPUT)
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(Ranged):
-    """What is computed once more, and what is different from the flight; nothing by default."""
+    """Source of a replay, and settings that differ from the flight; none by default."""
 
     source: Annotated[ReplayFrom, Parameter(name="--from", group=POLICY)] = "auto"
     """chunks: the guard alone, with the recorded chunks and without a policy; features: the policy

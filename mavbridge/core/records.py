@@ -147,7 +147,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOutcome:
-    """How the policy flew, from its first action to its last. None: not known."""
+    """Summary of a flight from the policy's first action to its last. None: not known."""
 
     end: FlightEnd
     reason: Reason | None

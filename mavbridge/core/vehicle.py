@@ -343,7 +343,7 @@ class ForwardedPacket(NamedTuple):
 
 
 class LinkArrivals(NamedTuple):
-    """What came from the vehicle since the last call, in order of arrival."""
+    """Samples and packets from the vehicle since the last call, in order of arrival."""
 
     samples: tuple[Sample, ...]
     packets: tuple[ForwardedPacket, ...]
