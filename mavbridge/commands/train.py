@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.text import Text
@@ -37,6 +38,10 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     require_device(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
     flights = _read_flights(paths, settings)
+    if settings.only_end and not any(np.isfinite(flight.gate).any() for flight in flights):
+        raise UserError(
+            "--only-end needs flights that say where the gates were, as mavbridge demonstrate does"
+        )
     network = fit_to_flights(network, flights, settings)
     return _finish(lambda hooks: train_policy(flights, network, settings, hooks))
 

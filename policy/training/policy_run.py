@@ -67,6 +67,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         self._ages_ns = _ages(flights, settings)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
         frame = network.contract.state_frame
         stages = policy_stages(settings)
         super().__init__(flights, trainee, stages, hooks, folder, state_frame=frame)
@@ -86,7 +87,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         self._encoded: FeatureStore | None = None
 
     def learning_rate(self, stage: TrainingStage) -> float:
-        if not stage.trains_encoder:
+        if not stage.trains_encoder and self._teacher is None:
             return HEAD_RATE * self.settings.learning_rate
         return self.settings.learning_rate * (FINE_TUNE_RATE if self.settings.start_from else 1)
 
@@ -95,11 +96,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 
     def encode(self) -> None:
         every = self._batches.frames
-        count = min(NORM_IMAGES, len(every))
-        chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
-        parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
-        with computing_in(self.device, self.bf16):
-            refresh_batch_norm(self.trainee, (self._images(part, False) for part in parts))
+        if self._teacher is None:
+            self._refresh_batch_norm(every)
         self._encoded = encode_frames(
             self.features,
             every,
@@ -107,6 +105,13 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
             mirror=self.settings.mirror,
             progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
         )
+
+    def _refresh_batch_norm(self, every: Indices) -> None:
+        count = min(NORM_IMAGES, len(every))
+        chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
+        parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
+        with computing_in(self.device, self.bf16):
+            refresh_batch_norm(self.trainee, (self._images(part, False) for part in parts))
 
     @torch.inference_mode()
     def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:
@@ -126,15 +131,20 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return self._batches.with_images
 
     def losses(self, batch: Batch) -> StepLoss:
-        loss: StepLoss = self.trainee(batch)
+        loss: StepLoss = self.trainee(self._with_targets(batch))
         return loss
+
+    def _with_targets(self, batch: Batch) -> Batch:
+        return batch if self._teacher is None else self._teacher.teach(batch)
 
     def validate(self) -> PolicyValidation | None:
         if self._held is None:
             return None
         with computing_in(self.device, self.bf16):
             batches = self._held.validation(VALIDATION_SAMPLES)
-            return validate(self.average, (batch.to(self.device) for batch in batches))
+            on_device = (batch.to(self.device) for batch in batches)
+            encoded = map(self.average.encoded, on_device)
+            return validate(self.average, map(self._with_targets, encoded))
 
     def export(self) -> None:
         card = self.card(
@@ -181,7 +191,8 @@ def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Traine
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
-            return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
+            weight = 0.0 if settings.only_end else settings.gate_weight
+            return Trainee(_checkpoint(network, settings.start_from), weight)
         return Trainee(build_policy(network), settings.gate_weight)
 
 

@@ -120,6 +120,9 @@ class TrainSettings(RunSettings):
     default those measured in the flights, or 20 to 90 ms where no policy flew."""
     start_from: Path | None = None
     """Checkpoint to start from, e.g. after more flights were added."""
+    only_end: bool = False
+    """Learn only what follows the last gate. Before it, --start-from is imitated in place of the
+    pilot, and its encoder stays as it is: the policy flies the gates as before."""
     repeats: int = 2
     """Moments after its exposure for which an encoded image is used in a step."""
     head_batch_size: int = 256
@@ -135,6 +138,8 @@ class TrainSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.only_end and self.start_from is None:
+            raise PolicyError("--only-end needs --start-from: the policy that learns the end")
         _ = self.age_range_ms
 
     @property
@@ -189,6 +194,8 @@ class TrainingStage(NamedTuple):
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
     """Return the stages: encoder and head, then the head alone."""
+    if settings.only_end:
+        return (TrainingStage("head", 1.0, False),)
     share = ENCODER_SHARE_OF_TIME if settings.steps is None else ENCODER_SHARE_OF_STEPS
     return TrainingStage("encoder and head", share, True), TrainingStage("head", 1.0, False)
 

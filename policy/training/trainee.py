@@ -60,6 +60,18 @@ class Trainee(nn.Module):
         """Return the batch with features in place of its images."""
         return replace(batch, features=self.encode(batch), images=None, grain=None)
 
+    @torch.no_grad()
+    def teach(self, batch: Batch) -> Batch:
+        """Return the batch with this policy's own chunks where a gate is still to come.
+
+        They take one step of the solver, as the built-in policies do in flight.
+        """
+        condition = self.condition(self.policy.visual_projection(self.encode(batch)), batch)
+        own = self.policy.head.sample(condition, 1).float()
+        is_next = ~batch.gate[:, 0].isnan().repeat_interleave(len(own) // len(batch.gate))
+        chunk = torch.where(is_next[:, None, None], own, batch.chunk)
+        return replace(batch, chunk=chunk, known=batch.known | is_next[:, None])
+
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
         """Return conditions [S, C] of projected images [B, C], each used for all of its samples."""
         visual = visual.repeat_interleave(len(batch.state) // len(visual), dim=0)
@@ -144,9 +156,9 @@ def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
 
 @torch.no_grad()
 def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
-    """Return losses and stick errors over all ``batches``, weighted by their size."""
+    """Return losses and stick errors over all ``batches`` of features, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
-    for batch in map(trainee.encoded, batches):
+    for batch in batches:
         losses = trainee(batch).metrics
         visual = trainee.policy.visual_projection(trainee.encode(batch))
         steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)

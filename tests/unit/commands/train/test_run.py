@@ -1,6 +1,7 @@
 """``mavbridge train`` and ``train-world-model``, from the command line to the checkpoint."""
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.networks import load_world_model
 from policy.contract import Contract
 from policy.data.flight_folders import read_flight
+from policy.loading.builtin import SHIPPED
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.nets.toge import TogeConfig
@@ -55,6 +57,20 @@ def test_a_world_model_is_trained(tmp_path: Path) -> None:
     model = load_world_model(out)
     assert model.config.image_size == 32
     assert model.config.contract.state_frame == "ned_frd"
+
+
+def test_the_end_is_not_learned_from_flights_without_gates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = write_spot_flight(tmp_path / "flight", 0, seconds=0.3), tmp_path / "a.safetensors"
+    flight = read_flight(folder)
+    blind = replace(flight, gate=np.full_like(flight.gate, np.nan))
+    monkeypatch.setattr(run, "read_flight", lambda _folder: blind)
+    start = ("--start-from", SHIPPED, "--only-end")
+    status, text = told_by("train", folder, "--out", out, *start, *SMALL)
+    assert status == 2
+    assert "say where the gates were" in text
+    assert not out.exists()
 
 
 def test_ctrl_c_keeps_the_best_weights_and_says_so(

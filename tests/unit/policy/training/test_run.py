@@ -26,7 +26,7 @@ from policy.training.policy_run import train_policy
 from policy.training.report import TrainingProgress, TrainResult
 from policy.training.run import TrainingError, TrainingStoppedError
 from policy.training.settings import TrainSettings
-from policy.training.trainee import gate_labels, gate_loss
+from policy.training.trainee import Trainee, gate_labels, gate_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -140,6 +140,45 @@ def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_p
     by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
     with pytest.raises(PolicyError, match="flies by sticks, these flights were flown by rates"):
         run(flights[:2], further, network=by_rates)
+
+
+def test_only_the_end_is_learned_and_the_gates_are_flown_as_before(flights, tmp_path):
+    start = tmp_path / "start.safetensors"
+    save_checkpoint(start, Toge(NETWORK))
+    ended = replace(flights[0], gate=np.full_like(flights[0].gate, np.nan))
+    asked = settings(
+        tmp_path, start_from=start, only_end=True, steps=40, learning_rate=3e-3, mirror=False
+    )
+
+    def errors(path: Path) -> tuple[float, float]:
+        """Return the distance of the chunks from the start's and from the pilot's."""
+        policy, before = (load_checkpoint(each, fallback=NETWORK) for each in (path, start))
+        store = store_frames(flights[:1], path.with_suffix(".frames"), 32)
+        batches = Batches(
+            Timeline(flights[:1], CONTRACT, np.array([40_000_000])),
+            store,
+            timesteps=100,
+            settings=asked,
+        )
+        batch = next(batches.validation(64))
+        trainee = Trainee(policy, 0.0)
+        chunk = trainee.teach(batch).chunk
+        return (
+            (chunk - Trainee(before, 0.0).teach(batch).chunk).abs().mean().item(),
+            (chunk - batch.chunk).abs().mean().item(),
+        )
+
+    run([ended] * 3, asked)
+    changed, error = errors(asked.out)
+    run(flights, asked)
+    kept, _ = errors(asked.out)
+    assert kept < 0.2 * changed
+    assert error < 0.6 * errors(start)[1]
+    before, after = weights_of(start), weights_of(asked.out)
+    same = {name for name in before if before[name] == after[name]}
+    assert {name for name in before if name.startswith("backbone.")} <= same
+    with pytest.raises(PolicyError, match="needs --start-from"):
+        replace(asked, start_from=None)
 
 
 def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_path, monkeypatch):
