@@ -2,10 +2,10 @@
 
 python -m benchmarks.train_shipped toge --out training
 
-toge starts from the weights shipped before, taken from this repository's history: in three rounds
-they fly, the expert corrects them, and they learn from that. toge-rates starts from nothing:
-flights of the expert, training, the student's flights, training, three times over. What shipped was
-made a little differently (policy/weights/README.md), and neither recipe has been run as a whole.
+Both start from the weights shipped before, taken from this repository's history. toge: in three
+rounds they fly, the expert corrects them, and they learn from that. toge-rates learns the end of a
+flight alone, in two rounds. What shipped was made a little differently (policy/weights/README.md),
+and neither recipe has been run as a whole.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
 kept, and an unfinished training begins again. Seeds determine the flights. Training budgets are
@@ -29,7 +29,7 @@ SIZE = "--set-config network.image_size=96"
 """Side of the recorded images."""
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, LOOPS, PX4 = "--action rates --courses race", "--courses loop", "--autopilot px4"
-STICKS, RATE_AGES = "--include-failed --ages 10:220", "--ages 10:140"
+STICKS, RATE_AGES = "--include-failed --ages 10:220", "--include-failed --ages 10:140"
 
 BEFORE = "438fb84af6f14453cf773d90c24cdd1e15b7b50a"
 """Commit of 2026-11-27 with the weights to start from."""
@@ -80,32 +80,27 @@ STEPS: dict[str, tuple[Step, ...]] = {
         ),
     ),
     "toge-rates": (
-        flights("races", f"--episodes 100 --seed 3 --speed 9.5 {RACES}"),
-        flights("races_px4", f"--episodes 30 --seed 4 --speed 9 {RACES} {PX4}"),
-        training("first", "races races_px4", f"--minutes 45 {RATE_AGES}"),
-        flights("own1", f"--episodes 54 --seed 11 --speed 9 {RACES}", "first"),
-        flights("own1_px4", f"--episodes 14 --seed 12 --speed 9 {RACES} {PX4}", "first"),
+        flights("races", f"--episodes 32 --seed 10 --speed 9.5 {RACES}"),
+        flights("loops", f"--episodes 10 --seed 15 --speed 9 --action rates {LOOPS}"),
+        flights("px", f"--episodes 8 --seed 14 --speed 9 {RACES} {PX4}"),
+        flights("own_races", f"--episodes 20 --seed 76 --speed 9.5 {RACES}", "before"),
+        flights("own_loops", f"--episodes 8 --seed 74 --speed 9 --action rates {LOOPS}", "before"),
+        flights("own_px", f"--episodes 8 --seed 75 --speed 9 {RACES} {PX4}", "before"),
         training(
-            "second",
-            "races races_px4 own1 own1_px4",
-            f"--minutes 22 {RATE_AGES}",
-            start="first",
+            "first",
+            "races loops px own_races own_loops own_px",
+            f"--minutes 10 --only-end {RATE_AGES}",
+            start="before",
         ),
-        flights("own2", f"--episodes 44 --seed 13 --speed 9 {RACES}", "second"),
-        flights("own2_px4", f"--episodes 20 --seed 14 --speed 9 {RACES} {PX4}", "second"),
-        training(
-            "third",
-            "races races_px4 own1 own1_px4 own2 own2_px4",
-            f"--minutes 22 {RATE_AGES}",
-            start="second",
+        flights("stopping", f"--episodes 16 --seed 78 --speed 9.5 --max-time 60 {RACES}", "first"),
+        flights(
+            "stopping_px", f"--episodes 10 --seed 79 --speed 9 --max-time 60 {RACES} {PX4}", "first"
         ),
-        flights("own3", f"--episodes 50 --seed 34 --speed 9 {RACES}", "third"),
-        flights("own3_px4", f"--episodes 24 --seed 35 --speed 9 {RACES} {PX4}", "third"),
         training(
             "toge-rates",
-            "races races_px4 own1 own1_px4 own2 own2_px4 own3 own3_px4",
-            f"--minutes 30 {RATE_AGES} --pack",
-            start="third",
+            "races loops px own_races own_loops own_px stopping stopping_px",
+            f"--minutes 9 --only-end {RATE_AGES} --pack",
+            start="before",
         ),
     ),
 }
@@ -122,8 +117,7 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
     """
     folder = out / policy
     folder.mkdir(parents=True, exist_ok=True)
-    if policy == "toge":
-        copy_weights_before(folder / "before.safetensors")
+    copy_weights_before(policy, folder / "before.safetensors")
     for step in STEPS[policy]:
         if step.command.startswith("demonstrate"):
             run(folder, f"{step.command} {SIZE} --workers {workers} --out {step.makes}")
@@ -132,11 +126,11 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
             (folder / "partial.safetensors").replace(folder / step.makes)
 
 
-def copy_weights_before(path: Path) -> None:
-    """Write the toge that shipped before; exit with a message if git lacks it."""
+def copy_weights_before(policy: str, path: Path) -> None:
+    """Write the weights that shipped before; exit with a message if git lacks them."""
     if path.exists():
         return
-    name = f"{BEFORE}:policy/weights/toge.safetensors"
+    name = f"{BEFORE}:policy/weights/{policy}.safetensors"
     partial = path.with_suffix(".part")
     try:
         with partial.open("wb") as file:
