@@ -27,6 +27,7 @@ from mavbridge.simulation.replay.compare import (
 )
 from mavbridge.simulation.replay.guard import (
     recorded_plan,
+    replay_guard,
     replay_other,
 )
 from mavbridge.simulation.replay.policy import replay_policy
@@ -124,6 +125,20 @@ def with_solve(source: ReplaySource, change: Callable[[Solve], Solve]) -> Replay
     solves = list(source.solves)
     solves[middle] = change(solves[middle])
     return replace(source, solves=tuple(solves))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_chunk_that_flies_was_still_on_its_way_at_the_tick_before(name: str) -> None:
+    """The end of its solve is recorded, not its arrival at the guard."""
+    source = golden(name)
+    first = next(k for k, tick in enumerate(source.ticks) if tick.chunk_serial is not None)
+    before, serial = source.ticks[first - 1], source.ticks[first].chunk_serial
+    solves = [
+        replace(each, computed_ns=before.woke_ns - 50_000) if each.serial == serial else each
+        for each in source.solves
+    ]
+    compared = compare_guard(replay_guard(replace(source, solves=tuple(solves))))
+    assert compared.first is None
 
 
 def test_one_bit_of_one_history_is_noticed(

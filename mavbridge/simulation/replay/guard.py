@@ -8,6 +8,7 @@ the operator or the flight process are derived from the phases.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import numpy as np
 
@@ -143,26 +144,28 @@ def _arrivals(
 ) -> Iterator[tuple[Tick, Chunk | None, OperatorCommand | None, EndRequest | None]]:
     """Yield each tick, and the messages of the flight process that the guard had got by then.
 
-    A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve.
+    A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve,
+    but the first one that flies only from its tick on: it may have been on its way before.
     """
     config = source.config
     is_called = not (config.arm or config.engage_channel or config.engage_on_arm)
     frame, solves = action_frame(source.contract), iter(source.solves)
     waiting = next(solves, None)
     before: Tick | None = None
-    for tick in source.ticks:
+    for tick, after in zip_longest(source.ticks, source.ticks[1:]):
         newest: Solve | None = None
-        while waiting is not None and _is_seen(waiting, tick):
+        while waiting is not None and _is_seen(waiting, tick, after):
             newest, waiting = waiting, next(solves, None)
         chunk = None if newest is None else chunk_of(newest, frame)
         yield tick, chunk, _act(before, tick, is_called=is_called), _stop(before, tick)
         before = tick
 
 
-def _is_seen(solve: Solve, tick: Tick) -> bool:
+def _is_seen(solve: Solve, tick: Tick, after: Tick | None) -> bool:
     if tick.chunk_serial is not None:
         return solve.serial <= tick.chunk_serial
-    return solve.computed_ns <= tick.woke_ns
+    is_next = after is not None and after.chunk_serial == solve.serial
+    return solve.computed_ns <= tick.woke_ns and not is_next
 
 
 def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand | None:
