@@ -29,7 +29,7 @@ SIZE = "--set-config network.image_size=96"
 """Side of the recorded images."""
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, LOOPS, PX4 = "--action rates --courses race", "--courses loop", "--autopilot px4"
-STICKS, RATE_AGES = "--include-failed --ages 10:220", "--include-failed --ages 10:140"
+STICKS, END = "--include-failed --ages 10:220", "--include-failed --ages 10:140 --only-end"
 
 BEFORE = "438fb84af6f14453cf773d90c24cdd1e15b7b50a"
 """Commit of 2026-11-27 with the weights to start from."""
@@ -89,7 +89,7 @@ STEPS: dict[str, tuple[Step, ...]] = {
         training(
             "first",
             "races loops px own_races own_loops own_px",
-            f"--minutes 10 --only-end {RATE_AGES}",
+            f"--minutes 10 {END}",
             start="before",
         ),
         flights("stopping", f"--episodes 16 --seed 78 --speed 9.5 --max-time 60 {RACES}", "first"),
@@ -99,7 +99,7 @@ STEPS: dict[str, tuple[Step, ...]] = {
         training(
             "toge-rates",
             "races loops px own_races own_loops own_px stopping stopping_px",
-            f"--minutes 9 --only-end {RATE_AGES} --pack",
+            f"--minutes 9 {END} --pack",
             start="before",
         ),
     ),

@@ -290,7 +290,7 @@ class VehicleText(str):
 
 
 class AdviceText(str):
-    """A text of the link about parameters or sticks, for which a check has rows of its own."""
+    """Text of the link about parameters or sticks; a check shows these in other rows."""
 
     __slots__ = ()
 

@@ -109,7 +109,7 @@ class FlightReferee:
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle hit something, in words; None if it was not seen to."""
+        """Description of the crash; None if none was seen."""
         return self._crashes.reason
 
     def ending(self, now_ns: int) -> EndRequest | None:

@@ -282,7 +282,7 @@ class ObservationSource:
         return np.concatenate([*parts, np.array(state.extras, np.float32)])[None]
 
     def _missing(self, camera: int, why: Reason) -> Reason:
-        """Of several cameras, name the one."""
+        """Return the reason, with the camera's name if there are several."""
         if len(self._cameras) == 1:
             return why
         return because(Code.OF_CAMERA, camera=self._cameras[camera], why=why)

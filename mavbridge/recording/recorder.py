@@ -86,7 +86,7 @@ class Recorder(ObserverThread):
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle has crashed so far, in words, or None; readable by any thread."""
+        """Description of the crash; None if none was seen. Readable by any thread."""
         return self._flight.crash_watch.reason
 
     @property

@@ -193,7 +193,7 @@ class TrainingStage(NamedTuple):
 
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
-    """Return the stages: encoder and head, then the head alone."""
+    """Return the stages: encoder and head, unless only the end is learned; then the head alone."""
     if settings.only_end:
         return (TrainingStage("head", 1.0, False),)
     share = ENCODER_SHARE_OF_TIME if settings.steps is None else ENCODER_SHARE_OF_STEPS

@@ -66,11 +66,15 @@ class Trainee(nn.Module):
 
         They take one step of the solver, as the built-in policies do in flight.
         """
-        condition = self.condition(self.policy.visual_projection(self.encode(batch)), batch)
-        own = self.policy.head.sample(condition, 1).float()
+        own = self.sample(batch, 1)
         is_next = ~batch.gate[:, 0].isnan().repeat_interleave(len(own) // len(batch.gate))
         chunk = torch.where(is_next[:, None, None], own, batch.chunk)
         return replace(batch, chunk=chunk, known=batch.known | is_next[:, None])
+
+    def sample(self, batch: Batch, num_diffusion_steps: int) -> Tensor:
+        """Sample chunks [S, horizon, 4] for the samples of a batch."""
+        visual = self.policy.visual_projection(self.encode(batch))
+        return self.policy.head.sample(self.condition(visual, batch), num_diffusion_steps).float()
 
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
         """Return conditions [S, C] of projected images [B, C], each used for all of its samples."""
@@ -160,9 +164,8 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
     for batch in batches:
         losses = trainee(batch).metrics
-        visual = trainee.policy.visual_projection(trainee.encode(batch))
         steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)
-        chunk = trainee.policy.head.sample(trainee.condition(visual, batch), steps).float()
+        chunk = trainee.sample(batch, steps)
         held = batch.history[:, -1:].expand_as(batch.chunk)
         guesses = (chunk, trainee.stick_mean.expand_as(batch.chunk), held)
         errors = [(guess - batch.chunk).abs()[batch.known].mean() for guess in guesses]
