@@ -38,9 +38,11 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     require_device(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
     flights = _read_flights(paths, settings)
-    if settings.only_end and not any(np.isfinite(flight.gate).any() for flight in flights):
+    blind = [flight.name for flight in flights if not np.isfinite(flight.gate).any()]
+    if settings.only_end and blind:
         raise UserError(
-            "--only-end needs flights that say where the gates were, as mavbridge demonstrate does"
+            "--only-end needs flights that say where the gates were, as mavbridge demonstrate "
+            f"writes them; {blind[0]} does not, so all of it would count as the end: leave it out"
         )
     network = fit_to_flights(network, flights, settings)
     return _finish(lambda hooks: train_policy(flights, network, settings, hooks))

@@ -13,6 +13,7 @@ from mavbridge.commands import train as run
 from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.networks import load_world_model
 from policy.contract import Contract
+from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED
 from policy.loading.load import load_policy
@@ -62,14 +63,21 @@ def test_a_world_model_is_trained(tmp_path: Path) -> None:
 def test_the_end_is_not_learned_from_flights_without_gates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, out = write_spot_flight(tmp_path / "flight", 0, seconds=0.3), tmp_path / "a.safetensors"
-    flight = read_flight(folder)
-    blind = replace(flight, gate=np.full_like(flight.gate, np.nan))
-    monkeypatch.setattr(run, "read_flight", lambda _folder: blind)
+    flights, out = tmp_path / "flights", tmp_path / "a.safetensors"
+    for name in ("blind", "sighted"):
+        write_spot_flight(flights / name, 0, seconds=0.3)
+
+    def read(folder: Path) -> FlightData:
+        flight = read_flight(folder)
+        unknown = np.full_like(flight.gate, np.nan)
+        return replace(flight, gate=unknown) if folder.name == "blind" else flight
+
+    monkeypatch.setattr(run, "read_flight", read)
     start = ("--start-from", SHIPPED, "--only-end")
-    status, text = told_by("train", folder, "--out", out, *start, *SMALL)
+    status, text = told_by("train", flights, "--out", out, *start, *SMALL)
     assert status == 2
     assert "say where the gates were" in text
+    assert "blind does not" in text
     assert not out.exists()
 
 
