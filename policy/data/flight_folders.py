@@ -108,8 +108,9 @@ def read_flight(folder: Path) -> FlightData:
     """Read one flight folder, complete or left by a crash.
 
     The sticks to imitate are the ``expert`` column if there is one; otherwise the pilot's after
-    taking over from the policy; otherwise the sent sticks; in a flight that sent nothing
-    (``--readonly``), the pilot's.
+    taking over from the policy; otherwise those that the policy flew; in a flight that sent nothing
+    (``--readonly``), the pilot's. A pilot's count only in a mode of the contract: in another mode
+    the same stick means something else.
     """
     name, meta = str(folder), _read_meta(folder)
     contract = _contract(meta)
@@ -162,17 +163,23 @@ def _sticks(
     name: str, meta: Mapping[str, object], ticks: pa.Table, terms: ActionTerms
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
-    sent = _sent(name, ticks, terms)
+    sent, modes = _sent(name, ticks, terms), _contract(meta).get("modes")
+    modes = modes if isinstance(modes, list) else Contract().modes
     is_expert = "expert" in ticks.column_names
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
-    is_correction = _corrections(meta, ticks)
+    is_in_mode = np.isin(ticks["mode"].to_pylist(), modes)
+    is_correction = is_in_mode & _corrections(meta, ticks)
     if not is_expert and is_correction.any():
         sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
         target, is_target = sent, is_correction
+    elif not is_expert:
+        is_policys = ticks["sent"].null_count < ticks.num_rows
+        is_target &= np.array(ticks["phase"]) == "flying" if is_policys else is_in_mode
     if not is_target.any():
         raise DatasetError(
-            f"{name}: nobody to learn from: no expert, and no stick was sent while armed"
+            f"{name}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks "
+            f"of a pilot while armed and in {' or '.join(map(str, modes))}"
         )
     return sent, target, is_target
 
@@ -191,21 +198,17 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
 
 
 def _corrections(meta: Mapping[str, object], ticks: pa.Table) -> NDArray[np.bool_]:
-    """Return the ticks in which a pilot flew on after taking over from the policy by the sticks.
-
-    Only in a mode of the contract do a pilot's sticks mean what the policy's mean.
-    """
+    """Return the ticks in which a pilot flew on after taking over from the policy by the sticks."""
     contract, outcome = _contract(meta), meta.get("outcome")
     is_takeover = isinstance(outcome, dict) and outcome.get("end") == "takeover"
     if not is_takeover or contract.get("action", "sticks") != "sticks":
         return np.zeros(ticks.num_rows, bool)
-    names = ("phase", "mode", "armed", "sent", "rc_sticks")
-    modes = contract.get("modes", ())
+    names = ("phase", "armed", "sent", "rc_sticks")
     rows = zip(*(ticks[name].to_pylist() for name in names), strict=True)
     return np.array(
         [
-            phase == "released" and armed and mode in modes and sent is None and sticks is not None
-            for phase, mode, armed, sent, sticks in rows
+            phase == "released" and armed and sent is None and sticks is not None
+            for phase, armed, sent, sticks in rows
         ],
         bool,
     )

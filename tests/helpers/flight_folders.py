@@ -42,6 +42,7 @@ def ticks_table(
     armed: Sequence[bool] | None = None,
     rc_sticks: Sequence[Sequence[float] | None] | None = None,
     phase: Sequence[str] | None = None,
+    mode: Sequence[str] | None = None,
 ) -> pa.Table:
     count = len(woke_ns)
     state = [LEVEL] * count if state is None else state
@@ -57,7 +58,7 @@ def ticks_table(
         "sent": pa.array(sent, _STICKS),
         "rc_sticks": pa.array(rc_sticks or [None] * count, _STICKS),
         "phase": pa.array(phase or ["flying"] * count),
-        "mode": pa.array(["ALT_HOLD"] * count),
+        "mode": pa.array(mode or ["ALT_HOLD"] * count),
         "armed": pa.array([True] * count if armed is None else armed, pa.bool_()),
     }
     if expert is not None:

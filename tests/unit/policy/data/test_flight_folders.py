@@ -68,6 +68,24 @@ def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path)
     np.testing.assert_allclose(episode.sent, [STICK] * 3)
 
 
+def test_only_what_the_policy_flew_is_imitated_not_the_guards_neutral_sticks(
+    tmp_path: Path,
+) -> None:
+    neutral, phases = (0.0,) * 4, ["preparing", "flying", "holding"]
+    folder = flight(tmp_path / "a", expert=None, sent=[neutral, STICK, neutral], phase=phases)
+    episode = read_flight(folder)
+    assert episode.target_ns.tolist() == WOKE[1:2]
+    np.testing.assert_allclose(episode.sent, [neutral, STICK, neutral])
+
+
+def test_a_pilots_sticks_are_imitated_in_modes_of_the_contract(tmp_path: Path) -> None:
+    pilot = {"expert": None, "sent": [None] * 3, "rc_sticks": [STICK] * 3}
+    modes = ["STABILIZE", "ALT_HOLD", "LAND"]
+    assert read_flight(flight(tmp_path / "a", **pilot, mode=modes)).target_ns.tolist() == WOKE[1:2]
+    with pytest.raises(DatasetError, match="a pilot while armed and in ALT_HOLD or ALTCTL"):
+        read_flight(flight(tmp_path / "b", **pilot, mode=["LOITER"] * 3))
+
+
 @pytest.mark.parametrize("end", ["takeover", "fault"])
 def test_after_a_takeover_the_pilots_sticks_alone_are_imitated(tmp_path: Path, end: str) -> None:
     pilots = (0.0, 0.0, 0.5, 0.0)
