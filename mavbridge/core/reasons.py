@@ -257,6 +257,7 @@ class Code(StrEnum):
     HANGS = _fault("the {name} has hung for {idle_s:.1f} s")
     GUARD_DIED = _fault("the guard has died")
     FLIGHT_PROCESS_DIED = _fault("the flight process has died")
+    UNREADABLE = _fault("the guard cannot read a message of the flight process: report this bug")
 
 
 _WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.OF_CAMERA)

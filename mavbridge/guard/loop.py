@@ -312,7 +312,12 @@ class GuardLoop:
         act: OperatorCommand | None = None
         received, self._received = [*self._received, *self._flight.receive()], []
         for data in received:
-            match decode_to_guard(data):
+            try:
+                message = decode_to_guard(data)
+            except ValueError:
+                self.stop(EndRequest(reason=because(Code.UNREADABLE), is_fault=True))
+                continue
+            match message:
                 case Chunk() as chunk:
                     absence = None
                 case Reason() as absence:

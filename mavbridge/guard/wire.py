@@ -181,19 +181,24 @@ def decode_from_guard(data: bytes) -> FromGuard:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that writes scalars of numpy, such as those of a user's contract, as plain ones.
+    """Pickler that writes texts and numbers of a user's contract as plain ones.
 
-    It writes members of an Enum by value: Python 3.11.2 (Debian 12) would write ``getattr``.
+    Scalars of numpy are such numbers, members of a StrEnum such texts. Members of our own Enums
+    are written by value: Python 3.11.2 (Debian 12) would write ``getattr``.
     """
 
     def reducer_override(self, value: Any) -> Any:
-        """Return how to rebuild a member of an Enum or a scalar of numpy; else NotImplemented."""
+        """Return how to rebuild an Enum's member, or a scalar of another type; NotImplemented."""
+        if not type(value).__module__.startswith("mavbridge."):
+            for plain in (str, int, float):
+                if isinstance(value, plain):
+                    return plain, (str.__str__(value) if plain is str else plain(value),)
         if isinstance(value, Enum):
             return type(value), (value.value,)
         if type(value).__module__ != "numpy" or getattr(value, "ndim", None) != 0:
             return NotImplemented
-        plain = value.item()
-        return type(plain), (plain,)
+        item = value.item()
+        return type(item), (item,)
 
 
 class _Unpickler(pickle.Unpickler):

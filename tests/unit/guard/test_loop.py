@@ -268,6 +268,14 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
     assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
 
 
+def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> None:
+    rig = Rig().flying()
+    rig.port.inbox.append(b"Snonsense")
+    rig.run(0.05)
+    assert rig.ticks[-1].phase is Phase.LEAVING
+    assert rig.ticks[-1].reason == because(Code.UNREADABLE)
+
+
 @pytest.mark.parametrize("has_policy", [True, False], ids=["flight", "weights still loading"])
 @pytest.mark.parametrize("seconds", [0.5, 60.0])
 def test_parameters_are_put_back_at_the_end_for_a_bounded_time(

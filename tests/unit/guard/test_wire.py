@@ -3,7 +3,7 @@
 import os
 import struct
 from collections.abc import Callable
-from enum import Enum
+from enum import Enum, StrEnum
 from functools import partial
 from pathlib import Path
 from subprocess import Popen
@@ -121,6 +121,21 @@ def test_a_number_of_numpy_crosses_as_a_plain_one(number: Any) -> None:
     received = decode_to_guard(encode_to_guard(message))
     assert received == message
     assert type(dict(received.data)["age_ms"]) in (float, int, bool)
+
+
+class Camera(StrEnum):
+    FRONT = "front"
+
+
+class Name(str):
+    """A user's own type of text."""
+
+
+@pytest.mark.parametrize("text", [Camera.FRONT, Name("front"), np.str_("front")])
+def test_a_text_of_a_users_own_type_crosses_as_a_plain_one(text: str) -> None:
+    received = decode_to_guard(encode_to_guard(because(Code.OF_CAMERA, camera=text)))
+    assert type(dict(received.data)["camera"]) is str
+    assert received == because(Code.OF_CAMERA, camera="front")
 
 
 def test_reasons_cross_in_python_3_11_2(monkeypatch: pytest.MonkeyPatch) -> None:
