@@ -126,6 +126,9 @@ def late(
     return reason if said is None else Reason(reason.code, (*reason.data, ("said", said)))
 
 
+_MALFORMED = (Code.EMPTY_CHUNK, Code.WRONG_KIND, Code.NOT_FINITE, Code.WRONG_SHAPE)
+
+
 class ChunkBuffer:
     """Newest chunk that may be flown, checked again at every send.
 
@@ -180,8 +183,6 @@ class ChunkBuffer:
             return False
         self._word_ns, self._is_stale = now_ns, False
         if (malformation := self._malformed(chunk)) is not None:
-            self._refused_ns.append(now_ns)
-            self._malformation = malformation
             self.explain_absence(malformation, now_ns)
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
@@ -223,6 +224,9 @@ class ChunkBuffer:
     def explain_absence(self, reason: Reason, now_ns: int) -> None:
         """Note why there is no chunk; the flight process answers, so no stall is bridged."""
         self._refusal, self._is_stale, self._word_ns = reason, False, now_ns
+        if reason.code in _MALFORMED:
+            self._refused_ns.append(now_ns)
+            self._malformation = reason
         graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
         self._until_ns = min(self._until_ns, graced_ns)
 

@@ -472,6 +472,17 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
     assert Code.UNUSABLE_CHUNKS not in codes(held.problem((now_ms + 1000) * MS))
 
 
+def test_results_of_a_wrong_shape_count_as_malformed_chunks() -> None:
+    held, wrong = buffer(), because(Code.WRONG_SHAPE, shape="[1, 3, 4]", most=1024)
+    for serial in range(1, MAX_REFUSED + 1):
+        now_ms = 1000 + 10 * serial
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+        assert held.fault(now_ms * MS) is None
+        held.explain_absence(wrong, (now_ms + 5) * MS)
+    fault = held.fault((now_ms + 5) * MS)
+    assert fault == because(Code.UNUSABLE_CHUNKS, chunks=MAX_REFUSED, why=wrong)
+
+
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:
     held = buffer()
     held.offer(chunk(2, 1000), 1000 * MS)
