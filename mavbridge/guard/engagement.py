@@ -67,6 +67,9 @@ class Engagement(Memory):
                 break  # the others act in the step in which they begin
         actions = self._control(now)
         begun = self._read(PROGRESS, now)
+        self.asked_ns.pop(now.status.mode, None)
+        if actions.mode is not None:
+            self.asked_ns[actions.mode] = now.now_ns
         return self._control(now) if begun in (Phase.FLYING, Phase.RELEASING) else actions
 
     def _read(self, rows: Sequence[Transition], now: EngagementInputs) -> Phase | None:
@@ -90,7 +93,7 @@ class Engagement(Memory):
             case Phase.FLYING:
                 return Actions(control=ControlSource.POLICY)
             case Phase.LEAVING | Phase.HOLDING:
-                if now.status.mode == self.disengage.mode:
+                if now.status.mode == self.disengage.mode or self.has_asked(now):
                     self.own_mode = now.status.mode
                 return self.disengage.step(now, self.unheard_ns)
             case Phase.RELEASING:
@@ -115,7 +118,9 @@ class Engagement(Memory):
             self.starting_ns = None
         elif self.starting_ns is None:
             self.starting_ns = now.now_ns
-            self.until_ns = max(self.until_ns, now.now_ns + self.first_chunk_ns)
+            if not self.is_extended:  # once: readiness that comes and goes must not last for ever
+                self.until_ns = max(self.until_ns, now.now_ns + self.first_chunk_ns)
+            self.is_extended = True
 
     def _watch(self, now: EngagementInputs) -> Actions:
         """Read-only: run the policy whenever it could fly; the link sends nothing."""

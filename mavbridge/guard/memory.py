@@ -28,6 +28,10 @@ REST_NS = 1_800 * NS_PER_MS
 dropped out for 0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
 
 
+LATE_NS = 1_500 * NS_PER_MS
+"""Longest time from a request for a mode to the report of it: a heartbeat a second, and a radio."""
+
+
 @dataclass(slots=True, kw_only=True)
 class Memory:
     """State that persists between steps."""
@@ -57,7 +61,11 @@ class Memory:
     """Start of the first flight."""
     own_mode: str | None = None
     """Mode of our flight, present or requested and entered; any change of it is a takeover."""
+    asked_ns: dict[str, int] = field(default_factory=dict)
+    """Last request for each mode that has not been reported since."""
     seen_interruptions: int = 0
+    is_extended: bool = False
+    """True once the deadline of PREPARING was moved for the policy's first chunk."""
     was_armed: bool = False
     """True if the vehicle was armed at the last step of PREPARING."""
     starting_ns: int | None = None
@@ -85,12 +93,22 @@ class Memory:
         """True if PREPARING follows an act, not ``--arm``."""
         return self.allowed_ns == ACT_TIMEOUT_NS
 
+    def has_asked(self, now: EngagementInputs) -> bool:
+        """True if the present mode is the late effect of a request of ours."""
+        asked_ns = self.asked_ns.get(now.status.mode)
+        return asked_ns is not None and now.now_ns - asked_ns <= LATE_NS
+
     def nothing(self, _now: EngagementInputs, _cause: object) -> None:
         """nothing"""
 
     def refuse(self, _: EngagementInputs, why: Reason) -> None:
         """refused, with the reason"""
         self.refusal, self.act = not_engaged(why), None
+
+    def call_off(self, _: EngagementInputs, _cause: bool) -> None:
+        """`--arm` is called off"""
+        self.refusal, self.act = not_engaged(because(Code.OPERATOR)), None
+        self.wants_arm = False
 
     def prepare(self, now: EngagementInputs, _cause: bool) -> None:
         """[the way in](#the-way-in)"""
@@ -100,7 +118,7 @@ class Memory:
         if self.wants_arm:
             climb_s = self.settings.takeoff_m or 0.0  # at 1 m/s; usual is 1.5 m/s
             self.allowed_ns = PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S)
-        self.wants_arm = self.was_armed = False
+        self.wants_arm = self.was_armed = self.is_extended = False
         self.until_ns = now.now_ns + self.allowed_ns
         self.seen_interruptions = now.link.interruptions
 

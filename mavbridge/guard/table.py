@@ -58,6 +58,11 @@ def arm_flag(m: Memory, now: EngagementInputs) -> bool:
     return m.wants_arm and now.link.problem is None
 
 
+def called_off(m: Memory, _: EngagementInputs) -> bool:
+    """the key `q`, and `--arm` waits"""
+    return m.wants_arm and m.act == "release"
+
+
 def not_set(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """the vehicle did not take a `--set`, and `--arm` waits for it"""
     problem = now.link.problem
@@ -113,10 +118,10 @@ def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
-    The mode was changed; the vehicle was disarmed, rebooted, is in a failsafe or follows sticks
-    other than ours; the override switch is low; the engage switch is low (in flight, or while an
-    engage command is carried out); the vehicle is silent while another one uses its system id; or a
-    relevant parameter was changed.
+    The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
+    was disarmed, rebooted, is in a failsafe or follows sticks other than ours; the override switch
+    is low; the engage switch is low (in flight, or while an engage command is carried out); the
+    vehicle is silent while another one uses its system id; or a relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -271,7 +276,8 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     if now.status.is_failsafe and now.status.armed:
         return because(Code.FAILSAFE, mode=now.status.mode)
     is_ours = now.status.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
-    if m.own_mode is not None and not is_ours:
+    is_late = m.phase in (LEAVING, HOLDING) and m.has_asked(now)
+    if m.own_mode is not None and not is_ours and not is_late:
         return because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
     return because(Code.DISARMED) if is_preparing and m.was_armed and not now.status.armed else None
 
@@ -292,6 +298,7 @@ AT_REST = (WAITING, RELEASED)
 TABLE = (
     Transition(AT_REST, ended, Memory.nothing, ENDED),
     Transition((WAITING,), not_set, Memory.give_up, ENDED),
+    Transition((WAITING,), called_off, Memory.call_off),
     Transition((WAITING,), arm_flag, Memory.prepare, PREPARING),
     Transition((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
     Transition(AT_REST, engage, Memory.prepare, PREPARING),

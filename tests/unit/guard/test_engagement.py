@@ -289,6 +289,16 @@ def test_the_first_chunk_after_a_reset_may_take_two_periods_more() -> None:
     assert stepped.phase is not Phase.PREPARING
 
 
+def test_readiness_that_comes_and_goes_does_not_prolong_the_way_in() -> None:
+    stepped = Stepped()
+    stepped.step()
+    stepped.step("engage", is_policy_reset=False)
+    for _ in range(4):
+        stepped.run(0.5, problem=because(Code.HEARTBEAT_LOST))
+        stepped.run(0.5, problem=None)
+    assert stepped.phase is not Phase.PREPARING
+
+
 def test_a_vehicle_that_is_silent_from_the_start_is_no_error() -> None:
     assert Stepped().step(heard_ns=-NS_PER_S) == NOTHING
 

@@ -100,6 +100,14 @@ def holding(**settings: Any) -> Stepped:
     return stepped
 
 
+def refused() -> Stepped:
+    """BRAKE was asked for 10 ms ago and refused: now LAND is asked for."""
+    stepped = flying(NO_RECEIVER)
+    stepped.step(chunk_fault=NO_CHUNK)
+    stepped.step(refused_mode="BRAKE", chunk_fault=None)
+    return stepped
+
+
 def releasing(facts: Any = AIRBORNE, **settings: Any) -> Stepped:
     stepped = flying(facts, **settings)
     stepped.step(mode="LOITER")
@@ -150,6 +158,10 @@ CASES = {
         0.97), {}, ENDED),
     "--arm waits for the link": Case(partial(waiting, altered(ON_GROUND,
         problem=because(LOST)), arm=True), {}, WAITING),
+    "key while --arm waits": Case(partial(waiting, altered(ON_GROUND, problem=because(LOST)),
+        arm=True), KEY, WAITING, refusal=Code.OPERATOR),
+    "--arm was called off": Case(lambda: after(partial(waiting, altered(ON_GROUND,
+        problem=because(LOST)), arm=True), 0.01, act="release"), {"problem": None}, WAITING),
     "--arm, a parameter refused": Case(partial(waiting, altered(ON_GROUND,
         problem=because(LOST)), arm=True), {"problem": because(Code.SET_REFUSED)}, ENDED),
     "a parameter refused, no --arm": Case(waiting, {"problem": because(Code.SET_REFUSED)},
@@ -301,6 +313,12 @@ CASES = {
     "takeover while leaving": Case(leaving, {"mode": "LOITER"}, RELEASING, RELEASE,
         why=Code.MODE_CHANGED),
     "our mode while leaving": Case(leaving, {"mode": "RTL"}, LEAVING, NEUTRAL),
+    "the mode before comes late": Case(lambda: after(refused, 1.48), {"mode": "BRAKE"}, LEAVING,
+        NEUTRAL, "LAND"),
+    "the mode before has come late": Case(lambda: after(refused, 2.0, mode="BRAKE"), {}, LEAVING,
+        NEUTRAL),
+    "the mode before comes too late to be ours": Case(lambda: after(refused, 1.49),
+        {"mode": "BRAKE"}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "30 s without a word": Case(lambda: after(leaving, 30.21, heard_ns=0), {}, RELEASING, RELEASE,
         why=Code.VEHICLE_LOST),
     "not 30 s yet": Case(lambda: after(leaving, 30.2, heard_ns=0), {}, LEAVING, NEUTRAL),
