@@ -51,6 +51,7 @@ class Code(StrEnum):
     NOT_ENGAGED = _waiting("not engaged: press e, use the engage switch, or --arm")
     NOT_ENGAGED_SINCE = _waiting("not engaged: {why}")
     STILL_ENDING = _waiting("the last flight is still ending ({phase})")
+    ENTERED_LATE = _waiting("the vehicle has entered {mode} late, by our request: change its mode")
     SWITCH_NOT_RESTED = _waiting(
         "the engage switch (channel {channel}) did not rest low for {rest_s:g} s with a receiver "
         "that works: leave it low for 2 s, then switch it on"

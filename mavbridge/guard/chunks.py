@@ -182,19 +182,18 @@ class ChunkBuffer:
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
         self._word_ns, self._is_stale = now_ns, False
-        if (malformation := self._malformed(chunk)) is not None:
-            self.explain_absence(malformation, now_ns)
+        if (defect := self._malformed(chunk)) is not None:
+            self.explain_absence(defect, now_ns)
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
         end_ns, self._seen = self._horizon_end_ns(chunk, now_ns), chunk
-        staleness = self._stale(chunk, now_ns)
-        is_stale = staleness is not None
-        if staleness is None and now_ns > end_ns:
-            staleness = because(Code.AFTER_HORIZON, **_horizon(chunk))
-        if staleness is not None:
+        if (staleness := self._stale(chunk, now_ns)) is not None:
             self.explain_absence(staleness, now_ns)
-            self._is_stale = is_stale
+            self._is_stale = True
+            return False
+        if now_ns > end_ns:
+            self.explain_absence(because(Code.AFTER_HORIZON, **_horizon(chunk)), now_ns)
             return False
         self._refusal = None
         if self.newest is not None:

@@ -105,6 +105,10 @@ class Memory:
         """refused, with the reason"""
         self.refusal, self.act = not_engaged(why), None
 
+    def tell(self, _: EngagementInputs, why: Reason) -> None:
+        """said, for it may not follow the pilot's sticks"""
+        self.refusal = why
+
     def call_off(self, _: EngagementInputs, _cause: bool) -> None:
         """`--arm` is called off"""
         self.refusal, self.act = not_engaged(because(Code.OPERATOR)), None

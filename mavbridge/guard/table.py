@@ -211,6 +211,11 @@ def over(m: Memory, _: EngagementInputs) -> bool:
     return m.disengage.is_done
 
 
+def entered_late(m: Memory, now: EngagementInputs) -> Reason | None:
+    """the vehicle enters a mode of ours after all, within 1.5 s of the request"""
+    return because(Code.ENTERED_LATE, mode=now.status.mode) if m.has_asked(now) else None
+
+
 # --- conditions
 
 
@@ -319,6 +324,7 @@ TABLE = (
     Transition((RELEASING,), released, Memory.forget, RELEASED),
 )
 PROGRESS = (
+    Transition((RELEASING, RELEASED), entered_late, Memory.tell),
     Transition((PREPARING,), ready, Memory.fly, FLYING),
     Transition((LEAVING, HOLDING), over, Memory.finish, RELEASING, where=may_release),
     Transition((LEAVING,), over, Memory.finish, HOLDING),

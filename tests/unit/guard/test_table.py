@@ -356,6 +356,10 @@ CASES = {
         why=Code.VEHICLE_LOST),
     # RELEASING
     "act while releasing": Case(releasing, ACT, RELEASING, RELEASE, refusal=Code.STILL_ENDING),
+    "our mode comes while releasing": Case(lambda: after(asked, 0.02, act="release",
+        is_released=False), {"mode": "ALT_HOLD"}, RELEASING, RELEASE, refusal=Code.ENTERED_LATE),
+    "our mode comes after the release": Case(lambda: after(asked, 0.02, act="release"),
+        {"mode": "ALT_HOLD"}, RELEASED, refusal=Code.ENTERED_LATE),
     "stop while releasing": Case(releasing, {"stop": SIGNAL}, RELEASING, RELEASE),
     "release seen": Case(releasing, {"is_released": True}, RELEASED, why=Code.MODE_CHANGED),
     "released although nothing was held": Case(flying, {**REBOOT, "is_released": True}, RELEASING,
