@@ -3,10 +3,11 @@
 import difflib
 import os
 from collections.abc import Sequence
+from inspect import signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliTokensError, convert
 from rich.text import Text
 
 import mavbridge
@@ -66,6 +67,14 @@ def _shown_default(value: object) -> str | None:
     return None if value in (False, "", None) else str(value)
 
 
+def _exactly(hint: Any, tokens: Sequence[Token]) -> Any:
+    """Convert words as cyclopts does, but refuse a fraction for an integer, which it rounds."""
+    words = [token.value for token in tokens if "." in token.value]
+    if hint in (int, int | None) and not all(float(word).is_integer() for word in words):
+        raise ValueError
+    return convert(hint, tokens)
+
+
 def _as_ours(error: CycloptsError) -> Text:
     """Format an error of the parser like all other errors."""
     text = str(error)
@@ -78,7 +87,7 @@ cli = App(
     name="mavbridge",
     help=HELP,
     version=mavbridge.__version__,
-    default_parameter=Parameter(show_default=_shown_default),
+    default_parameter=Parameter(show_default=_shown_default, converter=_exactly),
     error_formatter=_as_ours,
 )
 cli.register_install_completion_command(help="Install completion for this shell (bash, zsh, fish).")
@@ -337,16 +346,17 @@ def with_config(
             raise UserError(f"--config {config}: {error.strerror}") from error
         except ValueError as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
-        if "set_config" in document or "set-config" in document:
+        own = signature(with_config).parameters
+        if misplaced := [key for key in document if key.replace("-", "_") in own]:
             raise UserError(
-                f"--config {config}: set_config is no key of a file: write its sections"
+                f"--config {config}: {misplaced[0]} is no key of a file: use the command line"
             )
         for flag, value, what in [] if trust_config else untrusted_settings(document, tokens):
             raise UserError(
                 f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
-        cli.config = [*cli.config, Settings(document, source=str(config), commands=tuple(cli))]
+        cli.config = [*cli.config, Settings(document, source=str(config))]
     with run_log(log_file, verbose=verbose):
         status: int | None = cli(with_home(list(tokens)))
     return status or 0

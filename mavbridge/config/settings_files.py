@@ -4,7 +4,7 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +66,7 @@ def _foreign(key: str, value: str) -> str | None:
     if key == "camera":
         source = re.sub(r"^[A-Za-z_]\w*=", "", value)
         return "a program" if source.startswith("pipe:") else None
-    if key in _ADDRESS_KEYS and not _LOCAL.match(value):
+    if key in _ADDRESS_KEYS and (not _LOCAL.match(value) or (key == "host" and not value)):
         return "another computer, or a port that is open to others"
     if key in _OUTPUT_KEYS and (value.startswith(("/", "~")) or ".." in Path(value).parts):
         return "a place outside the working directory to write to"
@@ -95,22 +95,34 @@ def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]
 
 
 class Settings(Dict):
-    """A settings file, as a cyclopts configuration. The flag ``record`` has the name of a
-    command, so that the tables of ``commands`` are left out here."""
+    """A settings file, as a cyclopts configuration; keys at its top are flags of the command."""
 
-    def __init__(
-        self, data: Mapping[str, Any], *, source: str, commands: Container[str] = ()
-    ) -> None:
+    def __init__(self, data: Mapping[str, Any], *, source: str) -> None:
         super().__init__(with_home(data), source=source)
-        self._commands = commands
 
     def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-        """See ``Dict``, which leaves such keys out; tables for other commands stay left out."""
-        flags = {
-            k: v for k, v in self.data.items() if not (isinstance(v, dict) and k in self._commands)
-        }
+        """See ``Dict``, which leaves out keys with the name of a command, such as ``record``.
+
+        Raises:
+            UserError: a key would be ignored, or taken for another one.
+        """
+        for key, value in self.data.items():
+            inner = value if isinstance(value, dict) else {"": value}
+            for name in (f"--{key}.{each}".rstrip(".").replace("_", "-") for each in inner):
+                if flag := next((a.name for a in arguments if name in a.negatives), None):
+                    raise UserError(
+                        f"{self.source}: {name[2:]} is no key: write {flag[2:]} = false"
+                    )
+            is_section = any(a.name.startswith(f"--{key}.") for a in arguments)
+            if is_section and not isinstance(value, dict):
+                raise UserError(f"{self.source}: {key} is a section: write [{key}], and its keys")
+            if isinstance(value, dict) and not is_section:
+                raise UserError(
+                    f"{self.source}: there is no section [{key}] here: flags go to the top of a "
+                    "file, and --print-config shows the sections"
+                )
         update_argument_collection(
-            flags,
+            self.data,
             self.source,
             arguments,
             app.app_stack.stack[-1],

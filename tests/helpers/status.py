@@ -12,8 +12,10 @@ from mavbridge.config.flight import FlyConfig
 
 def status_of(*arguments: object) -> int:
     """Exit status of ``mavbridge`` with these arguments."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "config", cli.config)  # --config sets it, for all who parse later
+        with pytest.raises(SystemExit) as stopped:
+            main([str(argument) for argument in arguments])
     assert isinstance(stopped.value.code, int)
     return stopped.value.code
 
@@ -32,7 +34,6 @@ def asked_flight(*words: object) -> FlyConfig:
     """The configuration of the flight that these words ask for, which is not flown."""
     asked: list[FlyConfig] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "config", cli.config)  # --config sets it, for all who parse later
         patch.setattr("mavbridge.flight.app.fly", lambda config: asked.append(config) or 0)
         assert status_of(*words) == 0
     return asked[0]

@@ -34,9 +34,9 @@ def test_every_command_is_one_of_ours(
     for command in commands:
         _, outer, _ = cli.meta.parse_args(command.split(), print_error=False, exit_on_error=False)
         settings = given_settings(outer.arguments.get("set_config", ()))
-        own = Settings(settings, source="test", commands=tuple(cli))
-        monkeypatch.setattr(cli, "config", [own])
-        cli.parse_args(list(outer.args), print_error=False, exit_on_error=False)
+        with monkeypatch.context() as patch:
+            patch.setattr(cli, "config", [Settings(settings, source="test")])
+            cli.parse_args(list(outer.args), print_error=False, exit_on_error=False)
 
 
 def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_path: Path) -> None:

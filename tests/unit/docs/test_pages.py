@@ -74,7 +74,7 @@ def parse_mavbridge(arguments: list[str]) -> None:
         assert words[0] in cli, f"unknown command {words[0]}"
     settings = given_settings(outer.arguments.get("set_config", ()))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "config", [Settings(settings, source="test", commands=tuple(cli))])
+        patch.setattr(cli, "config", [Settings(settings, source="test")])
         cli.parse_args(words, print_error=False, exit_on_error=False)
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
 from helpers.status import asked_flight, told_by
-from mavbridge.cli import cli
 from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay import replay
 from mavbridge.config.settings_files import untrusted_settings
@@ -154,6 +153,7 @@ REFUSED = [
     (f'[fly]\ncamera = "{PIPE}"', "--camera"),
     (f'"--camera" = "{PIPE}"', "--camera"),
     (f'CAMERA = "{PIPE}"', "--camera"),
+    ('host = ""', "--host"),
     ('rerun = "connect=rerun+http://192.0.2.1:9876/proxy"', "--rerun"),
     ('host = "0.0.0.0"', "--host"),
     ('ray = "192.0.2.1:6379"', "--ray"),
@@ -177,10 +177,7 @@ set = ["RC_OVERRIDE_TIME=0.5"]
 
 
 @pytest.mark.parametrize(("text", "flag"), REFUSED)
-def test_a_settings_file_reaches_nothing_by_itself(
-    lure: Path, text: str, flag: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cli, "config", cli.config)
+def test_a_settings_file_reaches_nothing_by_itself(lure: Path, text: str, flag: str) -> None:
     path = lure / "mavbridge.toml"
     path.write_text(text)
     status, shown = told_by("--config", path, "--set-config", "link.timeout=0.1")
@@ -202,10 +199,7 @@ def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
     assert config.policy.contract == Path("mine.toml")
 
 
-def test_a_settings_file_that_is_trusted_may_name_a_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cli, "config", cli.config)
+def test_a_settings_file_that_is_trusted_may_name_a_program(tmp_path: Path) -> None:
     path = tmp_path / "mavbridge.toml"
     path.write_text('policy = "./there_is_none.py:Mine"\ncamera = "none"\n')
     words = ("--config", path, "--trust-config", "--connect", "udp:127.0.0.1:15691")
