@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -27,7 +27,27 @@ SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 """Modes of practically every camera; the smallest that covers the policy's image is used."""
-MAX_DRIVER_AGE_NS = NS_PER_S
+MAX_FIRST_AGE_NS = NS_PER_S
+"""Age up to which a stamp shows that its source stamps on our clock."""
+
+
+@dataclass(slots=True)
+class ExposureClock:
+    """Clock of one open source's stamps: ours from the first plausible stamp on.
+
+    Later stamps are then exposures at any age, so that an old image cannot pass for a new one.
+    """
+
+    is_ours: bool = False
+
+    def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
+        """Return the stamp if the source stamps on our clock, else the arrival.
+
+        Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
+        (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
+        """
+        self.is_ours = self.is_ours or 0 <= arrived_ns - stamp_ns <= MAX_FIRST_AGE_NS
+        return stamp_ns if self.is_ours and stamp_ns > 0 else arrived_ns
 
 
 @dataclass(slots=True)
@@ -39,8 +59,7 @@ class CaptureSource:
     failure: str
     clock: Clock
     has_driver_stamps: bool = False
-    is_our_clock: bool = False
-    """True once a driver's stamp was plausible; later stamps are then trusted at any age."""
+    stamps: ExposureClock = field(default_factory=ExposureClock)
 
     def next_image(self) -> Image:
         """See `ImageSource`."""
@@ -49,9 +68,7 @@ class CaptureSource:
         captured_ns = self.clock.now_ns()
         if self.has_driver_stamps:
             stamp_ns = round(self.capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
-            arrived_ns = captured_ns
-            captured_ns = exposure_ns(stamp_ns, arrived_ns, is_our_clock=self.is_our_clock)
-            self.is_our_clock = self.is_our_clock or captured_ns != arrived_ns
+            captured_ns = self.stamps.exposure_ns(stamp_ns, captured_ns)
         return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self.capture, self.name))
 
     def close(self) -> None:
@@ -132,16 +149,6 @@ def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
     if bgr.ndim == 2:
         return np.asarray(bgr, dtype=np.uint16)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def exposure_ns(stamp_ns: int, arrived_ns: int, *, is_our_clock: bool = False) -> int:
-    """Return the source's stamp if it is plausible or known to be of our clock, else the arrival.
-
-    Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
-    (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
-    """
-    is_plausible = 0 <= arrived_ns - stamp_ns <= MAX_DRIVER_AGE_NS
-    return stamp_ns if is_plausible or (is_our_clock and stamp_ns > 0) else arrived_ns
 
 
 def device_mode(image_size: int) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from struct import Struct
 from typing import NamedTuple
 
-from mavbridge.camera.capture import exposure_ns
+from mavbridge.camera.capture import ExposureClock
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
 from mavbridge.core.address import LOOPBACK, host_port, spelled
@@ -134,6 +134,7 @@ class JpegUdpSource:
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
+        self._stamps = ExposureClock()
         self._datagrams = self._bad_frames = 0
         self._silent_after_ns = clock.now_ns() + SILENT_NS
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -157,7 +158,7 @@ class JpegUdpSource:
         self._silent_after_ns = self._clock.now_ns() + SILENT_NS
         if (pixels := decode_picture(frame.picture)) is not None:
             self._bad_frames = 0
-            captured_ns = exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
+            captured_ns = self._stamps.exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
             return Image(captured_ns=captured_ns, rgb=pixels)
         self._bad_frames += 1
         if self._bad_frames > MAX_BAD_FRAMES:

@@ -8,7 +8,7 @@ import pytest
 from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS
 from mavbridge.camera import capture
-from mavbridge.camera.capture import exposure_ns, open_device, open_stream
+from mavbridge.camera.capture import ExposureClock, open_device, open_stream
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
@@ -29,8 +29,8 @@ from mavbridge.core.errors import CameraError
     ],
 )
 def test_the_drivers_stamp_is_taken_if_it_can_be_one(stamp_ms, is_our_clock, captured_ms):
-    taken_ns = exposure_ns(round(stamp_ms * NS_PER_MS), START_NS, is_our_clock=is_our_clock)
-    assert taken_ns == captured_ms * NS_PER_MS
+    stamps = ExposureClock(is_our_clock)
+    assert stamps.exposure_ns(round(stamp_ms * NS_PER_MS), START_NS) == captured_ms * NS_PER_MS
 
 
 def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):

@@ -27,7 +27,7 @@ from mavbridge.camera.jpeg_udp import (
 )
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.pipe_frames import MAX_JPEG_BYTES, decode_picture
-from mavbridge.core.clock import NS_PER_MS, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 
 FIRST_ID = (1 << 32) - 3
@@ -132,8 +132,11 @@ def test_the_newest_frame_is_read_and_older_ones_are_left(host):
         image = next_image(source)
         assert np.array_equal(image.rgb, scene(2))
         assert image.captured_ns == before_ns
-        sender.send(7, encoded(depth_scene(1), ".png"))
-        assert np.array_equal(next_image(source).rgb, depth_scene(1))
+        old_ns = before_ns - 3 * NS_PER_S
+        sender.send(7, encoded(depth_scene(1), ".png"), stamp_ns=old_ns)
+        image = next_image(source)
+        assert np.array_equal(image.rgb, depth_scene(1))
+        assert image.captured_ns == old_ns
     source.close()
 
 
