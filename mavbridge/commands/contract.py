@@ -6,6 +6,7 @@ from rich.console import Console
 
 from mavbridge.commands.config import ContractConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import write_output
 from policy.adapters.drafts import (
     Entry,
     checkpoint_entries,
@@ -30,11 +31,7 @@ def contract(source: Path, config: ContractConfig) -> int:
     if out.exists():
         raise UserError(f"{out} is there already: change that, or name another file by --out")
     text, summary = _draft(source, config.dataset)
-    try:
-        with out.open("x") as file:
-            file.write(text)
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror}") from error
+    write_output(out, text, "--out")
     Console(highlight=False, emoji=False, markup=False).print(f"{out}: {summary}", soft_wrap=True)
     return 0
 

@@ -26,7 +26,7 @@ from mavbridge.config.episodes import (
 from mavbridge.config.rates import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.files import require_writable, write_durably
+from mavbridge.core.files import require_writable, write_output
 from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.core.reasons import reason_from_json, reason_to_json
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -197,30 +197,21 @@ def evaluate(config: EvaluateConfig) -> int:
                             "another --json"
                         )
                     flown[index] = episode
-                    _keep(config, flown, flown_by)
+                    if config.resume and config.json is not None:
+                        write_output(config.json, to_json(config, flown, flown_by), "--json")
         except MavbridgeError as error:
             failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
     if flown:
         print_evaluation(config, flown, Console())
     if config.json is not None and (flown or failure is None):
-        config.json.write_text(to_json(config, flown, flown_by))
+        write_output(config.json, to_json(config, flown, flown_by), "--json")
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
     if failure is not None:
         raise failure
     return INTERRUPTED if was_stopped else 0
-
-
-def _keep(config: EvaluateConfig, flown: dict[int, FlownEpisode], flown_by: str) -> None:
-    """Write the results so far if the evaluation can be resumed."""
-    if config.resume and config.json is not None:
-        try:
-            write_durably(config.json, to_json(config, flown, flown_by))
-        except OSError as error:
-            reason = error.strerror or error
-            raise UserError(f"cannot write --json {config.json}: {reason}") from error
 
 
 def _fly(

@@ -23,7 +23,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.files import require_writable
+from mavbridge.core.files import require_writable, write_output
 from mavbridge.flight.app import fly_policy
 from mavbridge.flight.checks import check_flight
 from mavbridge.flight.plan import plan_flight
@@ -242,7 +242,7 @@ def identify(config: IdentifyConfig) -> int:
         raise PeerError(f"nothing could be measured: {'; '.join(found.missing)}")
     print_identification(found, trained, table_console())
     if config.json is not None:
-        config.json.write_text(to_json(found, trained, config))
+        write_output(config.json, to_json(found, trained, config), "--json")
     return 0
 
 

@@ -28,6 +28,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.settings_files import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
+from mavbridge.core.files import write_output
 from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.action_frames import action_frame
@@ -116,7 +117,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     )
     print_replay(result, table_console())
     if config.json is not None:
-        config.json.write_text(to_json(result))
+        write_output(config.json, to_json(result), "--json")
     if config.plot is not None:
         draw(result, config.plot)
     return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
@@ -384,4 +385,7 @@ def draw(result: ReplayResult, path: Path) -> None:
         title = f"{result.source.folder.name}: smoothed actions, replayed from {result.chosen}"
         figure.suptitle(title, x=0.012, ha="left", color=MUTED, fontsize=10)
         figure.tight_layout(rect=(0, 0, 1, 0.98))
-        figure.savefig(path)
+        try:
+            figure.savefig(path)
+        except OSError as error:
+            raise UserError(f"cannot write --plot {path}: {error.strerror or error}") from error

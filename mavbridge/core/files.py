@@ -44,19 +44,43 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
                 folder.rmdir()
 
 
+def write_output(path: Path, text: str, flag: str) -> None:
+    """Write the file that a flag names, durably where it can be replaced.
+
+    A link such as /dev/stdout, a device or pipe, and a file in a read-only folder are written in
+    place. Raises UserError if that fails.
+    """
+    is_plain = not path.is_symlink() and (path.is_file() or not path.exists())
+    try:
+        if is_plain and os.access(path.parent, os.W_OK):
+            write_durably(path, text)
+        else:
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(
+            f"cannot write {flag} {path}: {error.strerror or error}; make room there, or name "
+            "another file"
+        ) from error
+
+
 def write_durably(path: Path, text: str) -> None:
-    """Replace a file atomically and durably: a loss of power leaves the old or the new content.
+    """Replace a file atomically and durably.
+
+    A failure or a loss of power leaves the old or the new content, and a failure no other file.
 
     Raises:
         OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

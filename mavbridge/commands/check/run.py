@@ -20,7 +20,7 @@ from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
-from mavbridge.core.files import require_writable
+from mavbridge.core.files import require_writable, write_output
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import looks_at_images, require_images
 from policy.contract import Contract
@@ -60,7 +60,7 @@ def check(config: CheckConfig) -> int:
         rows.append(row)
     document = json.dumps(as_document(rows) | {"soak": soaked}, indent=2) + "\n"
     if config.json is not None and not is_on_stdout:
-        config.json.write_text(document)
+        write_output(config.json, document, "--json")
     print_check(rows, Console(stderr=is_on_stdout, highlight=False))
     if is_on_stdout:
         sys.stdout.write(document)

@@ -15,7 +15,7 @@ from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.series import FloatColumn, TickSeries
 from mavbridge.commands.output import number
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import UserError
+from mavbridge.core.files import write_output
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.viewer.layout import action_title
 
@@ -31,18 +31,15 @@ _HERE = files("mavbridge.commands.inspect")
 def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
     """Write one page with the flights side by side, which needs no other file and no network."""
     title = "mavbridge: " + " and ".join(flight.folder.name for flight in flights)
-    try:
-        text = _HERE.joinpath("page.html").read_text()
-        for name, value in (
-            ("title", html.escape(title)),
-            ("css", _HERE.joinpath("page.css").read_text()),
-            ("script", _HERE.joinpath("page.js").read_text()),
-            ("data", page_data(flights)),
-        ):
-            text = text.replace("{{" + name + "}}", value)
-        path.write_text(text)
-    except OSError as error:
-        raise UserError(f"--html {path}: {error}") from error
+    text = _HERE.joinpath("page.html").read_text()
+    for name, value in (
+        ("title", html.escape(title)),
+        ("css", _HERE.joinpath("page.css").read_text()),
+        ("script", _HERE.joinpath("page.js").read_text()),
+        ("data", page_data(flights)),
+    ):
+        text = text.replace("{{" + name + "}}", value)
+    write_output(path, text, "--html")
 
 
 def page_data(flights: Sequence[FlightAnalysis]) -> str:

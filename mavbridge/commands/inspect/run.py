@@ -20,7 +20,7 @@ from mavbridge.commands.inspect.page import write_page
 from mavbridge.commands.output import number, print_status, table_console
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.files import require_writable
+from mavbridge.core.files import require_writable, write_output
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
@@ -254,7 +254,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
     else:
         print_comparison(analyses, console)
     if config.json is not None:
-        config.json.write_text(to_json(analyses))
+        write_output(config.json, to_json(analyses), "--json")
     if config.html is not None:
         write_page(config.html, analyses)
         print_status(f"wrote {config.html}")

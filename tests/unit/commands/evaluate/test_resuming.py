@@ -1,6 +1,8 @@
 """An interrupted evaluation goes on: with the same flags and weights, and with no others."""
 
+import errno
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,23 @@ def test_what_was_flown_is_on_disk_and_not_flown_again(
     at_once = replace(config, json=tmp_path / "at_once.json")
     evaluate(at_once)
     assert config.json.read_text() == at_once.json.read_text()
+
+
+def test_a_full_disk_ends_the_evaluation_and_keeps_its_results(
+    flights: Flights, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate(replace(config, episodes=2))
+    text = config.json.read_text()
+
+    def fail(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(UserError, match=r"cannot write --json .*/out.json: No space left"):
+        evaluate(config)
+    assert flights.flown == [0, 1, 2]
+    assert config.json.read_text() == text
+    assert [*config.json.parent.iterdir()] == [config.json]
 
 
 def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
