@@ -12,7 +12,7 @@ from mavbridge.recording import rows
 from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
-from mavbridge.recording.tables import read_numbered, read_table, table_exists
+from mavbridge.recording.tables import count_lost, read_numbered, read_table, table_exists
 from mavbridge.recording.video.file import read_video
 from policy.data.flight_video import with_images
 
@@ -105,4 +105,5 @@ def _frames(
     if meta.finished and len(numbers) and not len(places):
         raise FlightError(f"{folder / video} holds none of {len(numbers)} images: copy it again")
     damage += more
-    return table.take(places), tuple(numbers[places].tolist())
+    table, numbers = count_lost(table.take(places), numbers[places]), numbers[places]
+    return table, tuple(numbers.tolist())

@@ -93,12 +93,22 @@ class TableWriter:
 def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
     """Read the table with this stem in either format; of a cut-off stream, the complete batches.
 
-    A sentence about any loss is appended to ``damage``.
+    A sentence about any loss is appended to ``damage``. ``dropped_before`` includes damaged rows.
 
     Raises:
         DatasetError: the table is missing or damaged, or lacks a column of ``schema``.
     """
-    return read_numbered(stem, schema, damage=damage)[0]
+    return count_lost(*read_numbered(stem, schema, damage=damage))
+
+
+def count_lost(table: pa.Table, numbers: NDArray[np.int64]) -> pa.Table:
+    """Add the rows that are missing between these numbers to ``dropped_before``."""
+    lost = np.diff(numbers, prepend=-1) - 1
+    if not lost.any():
+        return table
+    column = table.schema.get_field_index("dropped_before")
+    counts = table.column(column).to_numpy() + lost
+    return table.set_column(column, table.field(column), pa.array(counts.astype(np.int32)))
 
 
 def table_exists(stem: Path) -> bool:

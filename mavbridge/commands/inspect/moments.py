@@ -323,6 +323,9 @@ def _rows_lost(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment
     woke_ns = flight.ticks.column("woke_ns").to_pylist()
     for count, at_ns in zip(dropped, woke_ns, strict=True):
         if count:
-            detail = f"{count} ticks before this are not in the recording: the recorder fell behind"
+            detail = (
+                f"{count} ticks before this are not in the recording: the recorder fell behind, or "
+                "its file is damaged"
+            )
             lost_ms = 1000 * count / flight.meta.action_hz
             yield Moment(_t_s(ticks, at_ns), "rows lost", lost_ms, detail)

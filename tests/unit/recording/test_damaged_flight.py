@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -16,11 +17,12 @@ from policy.data.flight_folders import read_flight
 from policy.data.flight_video import video_parts
 
 TICKS, FRAMES = 6000, 90
+fly_tick = partial(make_tick, phase="flying")
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    events = [*map(make_frame, range(FRAMES)), *map(make_tick, range(TICKS))]
+    events = [*map(make_frame, range(FRAMES)), *map(fly_tick, range(TICKS))]
     return write_recording(tmp_path_factory.mktemp("finished") / "flight", events)
 
 
@@ -54,8 +56,8 @@ def test_rows_around_damaged_ones_are_read_and_those_are_counted(flight: Path) -
     first = pq.read_metadata(flight / "ticks.parquet").row_group(0).num_rows
     lost = spoil_second_group(flight / "ticks.parquet")
     back = open_flight(flight)
-    indices = [row.tick.index for row in back.tick_rows()]
-    assert indices == [*range(first), *range(first + lost, TICKS)]
+    read = [(row.tick.index, row.tick.serial) for row in back.tick_rows()]
+    assert read == [(index, index) for index in (*range(first), *range(first + lost, TICKS))]
     (text,) = back.damage
     assert f"ticks.parquet is damaged: {lost} of {TICKS} rows were skipped" in text
     learnt = read_flight(flight)
@@ -68,6 +70,7 @@ def test_rows_keep_their_images_where_the_video_is_damaged(flight: Path) -> None
     numbers = [*range(40), *range(60, FRAMES)]
     assert [number_of(rgb) for rgb in back.images()] == numbers
     assert [row.frame_id - 1 for row in back.frame_rows()] == numbers
+    assert {row.frame_id - 1: row.dropped_before for row in back.frame_rows()}[60] == 20
     assert len(back.damage) == 2
     learnt = read_flight(flight)
     assert [number_of(rgb) for rgb in learnt.decode()] == numbers
@@ -76,7 +79,7 @@ def test_rows_keep_their_images_where_the_video_is_damaged(flight: Path) -> None
 
 
 def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    events = [*map(make_frame, range(40)), *map(make_tick, range(1000))]
+    events = [*map(make_frame, range(40)), *map(fly_tick, range(1000))]
     folder = write_recording(tmp_path / "flight", events, finish=False)
     back = open_flight(folder)
     assert not back.meta.finished
@@ -100,4 +103,5 @@ def test_inspect_says_so(flight: Path, capsys: pytest.CaptureFixture[str]) -> No
     (document,) = json.loads(written.read_text())
     for name in ("ticks.parquet", "camera.mp4"):
         assert any(f"{name} is damaged" in text for text in document["damage"])
+    assert [moment["what"] for moment in document["moments"]] == ["rows lost"]
     assert "damage" in capsys.readouterr().out
