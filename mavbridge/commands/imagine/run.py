@@ -190,7 +190,8 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     """Read the context, from ``start_s`` after the first frame that has a state.
 
     Raises:
-        UserError: the flight is too short, has no states, or has them in another frame.
+        UserError: the flight is too short, has no states or images there, or has its states in
+            another frame.
         VideoError: its video is damaged.
     """
     _require_state_frame(flight, config)
@@ -212,6 +213,13 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
             f"{(captured_ns[-1] - first_ns) / NS_PER_S + start_s:.2f} s after it"
         )
     frames = [_nearest(captured_ns, at_ns) for at_ns in wanted_ns]
+    off_s = np.abs(captured_ns[frames] - np.array(wanted_ns)) / NS_PER_S
+    if off_s.max() >= dt_s / 2:  # otherwise no image is taken twice
+        raise UserError(
+            f"--start {flight.folder} has no image within {dt_s / 2:g} s of "
+            f"{start_s + off_s.argmax() * dt_s:.2f} s after its first state: choose another "
+            "--start-at"
+        )
     newest_ns = int(captured_ns[frames[-1]])
     # The newest state known at each exposure.
     known = np.searchsorted(state_ns, captured_ns[frames], side="right") - 1

@@ -61,6 +61,17 @@ def test_a_flight_without_states_frames_or_known_axes_is_refused(tmp_path: Path)
             read_start(flight, TINY, 0.0)
 
 
+def test_a_start_within_a_gap_of_the_camera_is_refused(flight: Path) -> None:
+    opened = open_flight(flight)
+    after_ns = opened.frames["captured_ns"].to_numpy() - START_NS
+    kept = np.flatnonzero((after_ns < 400 * NS_PER_MS) | (after_ns > 600 * NS_PER_MS))
+    gap = replace(opened, frames=opened.frames.take(kept), numbers=tuple(kept.tolist()))
+    for start_s, at in ((0.35, "0.45"), (0.5, "0.50")):
+        with pytest.raises(UserError, match=f"no image within 0.05 s of {at} s"):
+            read_start(gap, TINY, start_s)
+    assert read_start(gap, TINY, 0.3).newest_ns < read_start(gap, TINY, 0.6).newest_ns
+
+
 def test_a_policy_by_body_rates_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", action="rates")
     with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):
