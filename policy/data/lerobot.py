@@ -190,6 +190,8 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
         length = int(values["length"])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
+    if length < 1:
+        raise DatasetError(f"{name}: meta/episodes says that it has {length} rows: remove it")
     for path in (data, video):
         if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(info.folder)):
             raise DatasetError(f"{name}: {path} lies outside the dataset")
@@ -220,6 +222,12 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
     seconds = numbers(row.name, table, "timestamp").astype(np.float64)
     if not np.isfinite(seconds).all():
         raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
+    off_s = np.abs(seconds - seconds[0] - np.arange(row.length) / info.fps)
+    if off_s.max() > 0.5 / info.fps:
+        raise DatasetError(
+            f"{row.name}: the timestamp of row {off_s.argmax()} is {off_s.max():.3g} s off: rows "
+            f"are 1 / {info.fps:g} s apart by the fps of meta/info.json: mend one of them"
+        )
     timestamp_ns = np.round(seconds * NS_PER_S).astype(np.int64)
 
     def at(name: str) -> Nanoseconds:

@@ -132,16 +132,16 @@ def _state(**changes: object) -> Spoil:
     return _info(lambda info: info["features"]["observation.state"].update(changes))
 
 
-def _table(change: Callable[[pa.Table], pa.Table]) -> Spoil:
-    return lambda root: pq.write_table(change(pq.read_table(root / ROWS)), root / ROWS)
+def _table(change: Callable[[pa.Table], pa.Table], path: str = ROWS) -> Spoil:
+    return lambda root: pq.write_table(change(pq.read_table(root / path)), root / path)
 
 
-def _rows(name: str, change: Callable[[list[Any]], list[Any]]) -> Spoil:
+def _rows(name: str, change: Callable[[list[Any]], list[Any]], path: str = ROWS) -> Spoil:
     def edited(table: pa.Table) -> pa.Table:
         values = pa.array(change(table[name].to_pylist()), table[name].type)
         return table.set_column(table.column_names.index(name), name, values)
 
-    return _table(edited)
+    return _table(edited, path)
 
 
 def _nan(values: list[Any]) -> list[Any]:
@@ -166,6 +166,9 @@ def _scalar_state(table: pa.Table) -> pa.Table:
         (_state(info={"state_frame": "body"}), "state frame is 'body'"),
         (_rows("observation.state", _nan), "NaN or infinity in row 3"),
         (_rows("timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
+        (_rows("timestamp", lambda v: [3 * t for t in v]), "row 11 is 0.88 s off: .* 1 / 25 s"),
+        (_rows("timestamp", lambda v: [0.0] * len(v)), "row 11 is 0.44 s off"),
+        (_rows("length", lambda v: [12, 0], EPISODES), "has 0 rows"),
         (_table(lambda table: table.drop_columns(["action"])), "lacks .*action"),
         (_table(lambda table: table.slice(0, 15)), "holds 3 rows"),
         (_table(_scalar_state), "13 numbers a row"),
