@@ -247,8 +247,10 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
     """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
     Raises:
-        UserError: ``out`` is not empty, or cannot be written.
+        UserError: ``out`` has no name, is not empty, or cannot be written.
     """
+    if not out.name:
+        raise UserError(f"--out {str(out)!r} has no name: name a new folder")
     part = out.with_name(f"{out.name}.unfinished")
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):

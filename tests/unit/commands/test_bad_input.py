@@ -51,6 +51,7 @@ BAD = [
     ("export foreign --out new", "not a flight of mavbridge"),
     ("export spots --out foreigners", "not empty"),
     ("export spots --out left", "was killed"),
+    ("export spots --out .", "name a new folder"),
     ("export spots --out new --image-size 0", "--image-size"),
     ("export spots --out new --image-size 97", "--image-size"),
     ("export spots --out new --image-size 5000", "--image-size"),
