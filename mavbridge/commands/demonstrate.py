@@ -242,7 +242,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
         MavbridgeError: it cannot be flown or recorded.
     """
     rmtree(spec.folder, ignore_errors=True)
-    prepare_folder(spec.folder)
+    prepare_folder(spec.folder, "--out")
     with ExitStack() as stack:
         return _fly(spec, should_stop, stack)
 

@@ -36,6 +36,6 @@ def check_flight(config: FlyConfig) -> None:
     if config.gates is not None:
         read_gates(config.gates)
     if config.record is not None:
-        prepare_folder(config.record)
+        prepare_folder(config.record, "--record")
     check_target(config.rerun)
     require_cameras(config)

@@ -40,13 +40,13 @@ def require_extra(what: str) -> None:
     require_packages(what, {name: name for name in EXTRA})
 
 
-def prepare_folder(folder: Path) -> None:
-    """Create the folder and check that a flight can be recorded into it.
+def prepare_folder(folder: Path, flag: str) -> None:
+    """Create the folder that a flag names and check that a flight can be recorded into it.
 
     Raises:
         UserError: the extra is not installed, or the folder is not empty or cannot be written.
     """
-    require_extra("--record")
+    require_extra(flag)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         taken = sorted(entry.name for entry in folder.iterdir())
@@ -56,11 +56,11 @@ def prepare_folder(folder: Path) -> None:
             probe.unlink()
     except OSError as error:
         raise UserError(
-            f"--record {folder} cannot be written ({error.strerror}); name a folder that you may "
+            f"{flag} {folder} cannot be written ({error.strerror}); name a folder that you may "
             "write to"
         ) from error
     if taken:
         raise UserError(
-            f"--record {folder} is not empty (it holds {taken[0]}); every flight has a folder of "
+            f"{flag} {folder} is not empty (it holds {taken[0]}); every flight has a folder of "
             "its own: name a new one"
         )

@@ -205,7 +205,7 @@ class Episodes:
             UserError, WriterError: its folder cannot be written, or its writer does not start.
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
-        prepare_folder(folder)
+        prepare_folder(folder, "--out")
         begin_ns = self._clock.now_ns()
         try:
             pipe = open_tlog_pipe()

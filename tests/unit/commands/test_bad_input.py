@@ -36,6 +36,7 @@ BAD = [
     ("check --connect none --policy none --soak 60", "--soak needs a policy"),
     ("contract empty", "neither a LeRobot policy"),
     ("contract broken.onnx", "broken.onnx cannot be read as ONNX"),
+    ("demonstrate --out /proc/none --episodes 1", "--out /proc/none"),
     ("demonstrate --out new --seed 100", "--seed must be between 0 and"),
     ("demonstrate --out new --solve-time 100", "give its --checkpoint"),
     ("demonstrate --out new --policy toge-rates", "toge-rates is the student"),

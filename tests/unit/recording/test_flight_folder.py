@@ -158,14 +158,14 @@ def test_a_folder_that_cannot_take_a_flight_is_refused(
 ) -> None:
     (tmp_path / "notes.txt").write_text("precious")
     with pytest.raises(UserError, match=r"is not empty \(it holds notes.txt\)"):
-        prepare_folder(tmp_path)
+        prepare_folder(tmp_path, "--out")
     with pytest.raises(UserError, match="cannot be written"):
-        prepare_folder(tmp_path / "notes.txt")
-    with pytest.raises(UserError, match="cannot be written"):
-        prepare_folder(Path("/proc/nowhere"))
+        prepare_folder(tmp_path / "notes.txt", "--out")
+    with pytest.raises(UserError, match="--out /proc/nowhere cannot be written"):
+        prepare_folder(Path("/proc/nowhere"), "--out")
     monkeypatch.setattr(names, "EXTRA", ("av", "no_such_module"))
     with pytest.raises(UserError, match=r"needs no_such_module: pip install no_such_module"):
-        prepare_folder(tmp_path / "new")
+        prepare_folder(tmp_path / "new", "--out")
 
 
 def test_what_ran_comes_back_and_older_flights_know_nothing_of_it(flight: Path) -> None:
