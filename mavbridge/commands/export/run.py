@@ -5,6 +5,7 @@ had all arrived by then, and the newest sticks to imitate up to then. Nothing is
 stamps give the age of each.
 """
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -246,6 +247,8 @@ def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[Imag
 def whole_or_nothing(out: Path) -> Iterator[Path]:
     """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
+    SIGTERM ends the block as Ctrl-C does, and no folder stays.
+
     Raises:
         UserError: ``out`` has no name, is not empty, or cannot be written.
     """
@@ -264,6 +267,7 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
         ) from error
     except OSError as error:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
+    terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield part
         part.rename(out)
@@ -271,3 +275,4 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
     finally:
         rmtree(part, ignore_errors=True)
+        signal.signal(signal.SIGTERM, terminate)

@@ -3,6 +3,7 @@
 import json
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -227,14 +228,19 @@ def full(*_: object, **__: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def interrupted(folder: Path) -> FlightData:
-    signal.raise_signal(signal.SIGINT)
+def interrupted(folder: Path, number: int = signal.SIGINT) -> FlightData:
+    assert signal.getsignal(number) is not signal.SIG_DFL
+    signal.raise_signal(number)
     return read_flight(folder)
 
 
 @pytest.mark.parametrize(
     ("name", "act", "status"),
-    [("dataset.pq.write_table", full, 2), ("run.read_flight", interrupted, 130)],
+    [
+        ("dataset.pq.write_table", full, 2),
+        ("run.read_flight", interrupted, 130),
+        ("run.read_flight", partial(interrupted, number=signal.SIGTERM), 130),
+    ],
 )
 def test_nothing_is_left_of_an_export_that_breaks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, act: object, status: int
