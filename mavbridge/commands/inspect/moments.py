@@ -321,11 +321,11 @@ def _image_gaps(
 def _rows_lost(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
     dropped = flight.ticks.column("dropped_before").to_pylist()
     woke_ns = flight.ticks.column("woke_ns").to_pylist()
-    for count, at_ns in zip(dropped, woke_ns, strict=True):
+    for count, before_ns, at_ns in zip(dropped, woke_ns[:1] + woke_ns, woke_ns, strict=False):
         if count:
             detail = (
                 f"{count} ticks before this are not in the recording: the recorder fell behind, or "
                 "its file is damaged"
             )
-            lost_ms = 1000 * count / flight.meta.action_hz
+            lost_ms = (at_ns - before_ns) / NS_PER_MS
             yield Moment(_t_s(ticks, at_ns), "rows lost", lost_ms, detail)
