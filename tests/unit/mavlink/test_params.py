@@ -11,7 +11,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import AdviceText, Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamWrite
-from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT, ArduPilot
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.checks import serial_dangers
 
@@ -138,24 +138,40 @@ def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "before", "flag"),
-    [("SIMPLE", 63.0, "SIMPLE=0"), ("RC7_OPTION", 13.0, "RC7_OPTION=0"), ("THR_DZ", 90.0, "")],
+    ("names", "times"),
+    [
+        (("SIMPLE",), 3),
+        (("RC7_OPTION",), 3),
+        (("THR_DZ",), 0),
+        (("SIMPLE", "THR_DZ"), 3),
+        (("THR_DZ", "RC7_OPTION", "SUPER_SIMPLE", "RC8_OPTION", "RC_OVERRIDE_TIME"), 3),
+    ],
 )
 def test_simple_mode_that_is_set_off_is_switched_off_as_well(
-    name: str, before: float, flag: str
+    names: tuple[str, ...], times: int
 ) -> None:
     """By its parameter alone it would last until the mode switch moves."""
-    wanted = flag or "THR_DZ=100"
-    key, _, value = wanted.partition("=")
-    vehicle = ParamVehicle({name: before, "SUPER_SIMPLE": 0.0}, set_params=((key, float(value)),))
+    wanted = tuple((name, 0.5 if name == "RC_OVERRIDE_TIME" else 0.0) for name in names)
+    vehicle = ParamVehicle(dict.fromkeys(names, 13.0), set_params=wanted)
     vehicle.run(10.0)
     off = CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, (3.0, 0.0))
 
-    assert vehicle.writes == [(key, float(value))]
-    assert [r for r in vehicle.requests if isinstance(r, CommandRequest)] == [off] * (
-        3 if flag else 0
-    )
+    assert vehicle.writes == list(wanted)
+    assert [r for r in vehicle.requests if isinstance(r, CommandRequest)] == [off] * times
     assert vehicle.problem() is None
+
+
+def test_different_follow_ups_are_all_sent() -> None:
+    class TwoCommands(ArduPilot):
+        def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
+            return CommandRequest(len(name), (before, now)) if "SIMPLE" in name else None
+
+    names = ("SIMPLE", "SUPER_SIMPLE", "THR_DZ")
+    wanted = tuple((name, 0.0) for name in names)
+    vehicle = ParamVehicle(dict.fromkeys(names, 1.0), profile=TwoCommands(), set_params=wanted)
+    vehicle.run(10.0)
+    sent = [r.command for r in vehicle.requests if isinstance(r, CommandRequest)]
+    assert sorted(sent) == [6, 6, 6, 12, 12, 12]
 
 
 # --- changes after reading

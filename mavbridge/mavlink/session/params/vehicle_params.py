@@ -114,8 +114,8 @@ class VehicleParams:
             before=old_params,
             report=report,
         )
-        self._follow_up: CommandRequest | None = None
-        self._follow_ups_left = self._follow_up_ns = 0
+        self._follow_ups: dict[CommandRequest, tuple[int, int]] = {}
+        """Number of times still to send each command, and the time of the next [ns]."""
         self._advised: ParamContext | None = None
         """Context of the last advice to the user."""
         self._assessed: Assessment | None = None
@@ -158,9 +158,12 @@ class VehicleParams:
         self._changes.receive(param)
         if not self.is_read or old == self._reader.values.get(param.name):
             return
-        if old is not None and param.name in dict(self._config.set_params):
-            self._follow_up = self._profile.follow_up(param.name, old, param.value)
-            self._follow_ups_left, self._follow_up_ns = _FOLLOW_UPS, 0
+        if (
+            old is not None
+            and param.name in dict(self._config.set_params)
+            and (command := self._profile.follow_up(param.name, old, param.value)) is not None
+        ):
+            self._follow_ups[command] = (_FOLLOW_UPS, 0)
         before, after = self._assessed, self._assess(status)
         is_armed = status is not None and status.armed
         if not is_armed or old is None or before is None:
@@ -200,9 +203,10 @@ class VehicleParams:
                 is_disarmed=status is not None and not status.armed,
             ):
                 yield self._as_written(request)
-        if self._follow_up and self._follow_ups_left and now_ns >= self._follow_up_ns:
-            self._follow_ups_left, self._follow_up_ns = self._follow_ups_left - 1, now_ns + NS_PER_S
-            yield self._follow_up
+        for command, (left, due_ns) in list(self._follow_ups.items()):
+            if left and now_ns >= due_ns:
+                self._follow_ups[command] = (left - 1, now_ns + NS_PER_S)
+                yield command
 
     def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
         """Return a write with the type that the firmware demands, if any."""
