@@ -203,12 +203,15 @@ class MavlinkLink:
 
     def _receive(self, vehicle: VehicleSession, message: ReceivedMessage, arrived_ns: int) -> None:
         """Process one message of the chosen vehicle."""
+        if isinstance(message.body, LocalVelocity) and not (
+            vehicle.condition.is_velocity_usable(arrived_ns)
+        ):
+            self._counters.receive(f"{message.name} (invalid)", message.sequence, arrived_ns)
+            vehicle.receive(message, arrived_ns)
+            return
         self._counters.receive(message.name, message.sequence, arrived_ns)
         happened_ns, is_for_us = arrived_ns, True
         match message.body:
-            case LocalVelocity() if not vehicle.condition.is_velocity_usable(arrived_ns):
-                vehicle.receive(message, arrived_ns)
-                return  # the estimator reports no valid velocity
             case body if isinstance(body, Measurement):
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
                 self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)

@@ -1,5 +1,6 @@
 """``mavbridge check`` against both firmwares of the simulated vehicle, on virtual time."""
 
+import math
 from dataclasses import replace
 from itertools import repeat
 from typing import Any
@@ -33,6 +34,7 @@ class Bench:
         autopilot: AutopilotName = "ardupilot",
         *,
         receiver: bool = True,
+        position: bool = True,
         params: dict[str, float] | None = None,
     ) -> None:
         self.clock = SteppedClock()
@@ -43,6 +45,7 @@ class Bench:
                 NOMINAL_VEHICLE,
                 autopilot=autopilot,
                 receiver_us=MID_RECEIVER_US if receiver else None,
+                position_ready_s=NOMINAL_VEHICLE.position_ready_s if position else math.inf,
             ),
         )
         for name, value in (params or {}).items():
@@ -115,6 +118,14 @@ def test_a_px4_is_told_what_its_sticks_cannot_do(receiver: bool) -> None:
     assert rows["full yaw rate"].verdict == "warn"
     assert "202 deg/s" in rows["full yaw rate"].advice
     assert rows["echo test"].found == "taken, and released"
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_velocity_without_a_position_does_not_count(autopilot: AutopilotName) -> None:
+    """PX4 sends one all the same, which a flight does not use."""
+    row = Bench(autopilot, position=False).check(contract=Contract())["velocity"]
+    assert (row.verdict, row.found) == ("no-go", "0.0 Hz")
+    assert "the estimator has no position yet" in row.advice
 
 
 @pytest.mark.parametrize(

@@ -256,7 +256,7 @@ def _rate_row(
     row = partial(_link_row, name, f"{rate_hz:.1f} Hz", f"{group.rate_hz:.3g} Hz")
     if rate_hz == 0.0 and name == "velocity":
         return row(
-            no_go="no velocity comes: the estimator has no position yet (some 40 s after the "
+            no_go="no valid velocity comes: the estimator has no position yet (some 40 s after the "
             "start, and never without GPS or another source of position)"
         )
     if rate_hz < least_hz:
