@@ -7,6 +7,9 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
+_MOST_OVERTAKEN = 16
+"""Largest number of messages that overtake one; a longer step back is an outage."""
+
 
 class LinkCounters:
     """Counters of messages and losses of the chosen vehicle."""
@@ -20,11 +23,18 @@ class LinkCounters:
         self.sent = 0
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
-        """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256)."""
+        """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256).
+
+        An overtaken message fills the gap that it left; a doubled one leaves none.
+        """
         self._by_name[name] += 1
-        if self._last_sequence is not None:
-            self._lost += (sequence - self._last_sequence - 1) % 256
-        self._last_sequence = sequence
+        last = self._last_sequence
+        ahead = 1 if last is None else (sequence - last) % 256
+        if ahead >= 256 - _MOST_OVERTAKEN:
+            self._lost = max(self._lost - 1, 0)
+        elif ahead > 0:
+            self._lost += ahead - 1
+            self._last_sequence = sequence
         self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
         self._last_ns = arrived_ns
 

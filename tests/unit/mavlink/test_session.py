@@ -388,6 +388,24 @@ def test_the_newest_reading_by_the_vehicles_clock_is_held(
     assert velocities(*received) == held
 
 
+@pytest.mark.parametrize(
+    ("sequences", "lost"),
+    [
+        ((254, 255, 1, 0, 2, 3), 0),  # overtaken
+        ((254, 255, 255, 0, 0, 1), 0),  # doubled
+        ((0, 2, 1, 3, 5, 6), 1),
+        ((7, 6, 8, 9), 0),  # the counters began between the two
+        ((0, 201, 202, 203), 200),  # an outage
+    ],
+)
+def test_a_message_out_of_order_is_not_lost(sequences: tuple[int, ...], lost: int) -> None:
+    counters, rest = LinkCounters(), {"unusable_packets": 0, "refused_signatures": 0}
+    for k, sequence in enumerate(sequences):
+        counters.receive("ATTITUDE", sequence, k * S)
+    found = counters.stats(TimesyncFilter(), echo_confirmed=None, saturated={}, **rest)
+    assert found.lost_fraction == pytest.approx(lost / (lost + len(sequences)))
+
+
 def test_losses_are_gaps_in_the_sequence() -> None:
     counters, sync = LinkCounters(), TimesyncFilter()
 
