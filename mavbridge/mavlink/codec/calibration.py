@@ -108,10 +108,8 @@ class RcCalibration:
         """Channels in the order of ``Sticks``."""
         return self.throttle, self.yaw, self.pitch, self.roll
 
-    def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm | None:
-        """Return the PWM of the four sticks; None for a vehicle with fewer than eight channels."""
-        if len(channels_us) < 8:
-            return None
+    def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm:
+        """Return the PWM of the four sticks among at least eight channels."""
         t, y, p, r = (channels_us[channel.number - 1] for channel in self.channels)
         return t, y, p, r
 

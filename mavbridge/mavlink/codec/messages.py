@@ -74,6 +74,7 @@ class RcChannels(NamedTuple):
     """RC_CHANNELS (65): channels that the vehicle acts on [us]; 0: unused, 65535, out of range."""
 
     channels_us: tuple[int, ...]
+    """At least eight."""
     boot_us: int = 0
     """Vehicle's clock since boot."""
 

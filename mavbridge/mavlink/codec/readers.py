@@ -126,7 +126,8 @@ def _milli_g_imu(
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
     channels_us = tuple(us if us in RADIO_US else 0 for us in _CHANNELS(m))
-    return RcChannels(channels_us[: m.chancount or 18], 1000 * m.time_boot_ms)
+    # ArduPilot counts the receiver's channels, and also fills those that were overridden.
+    return RcChannels(channels_us[: max(m.chancount or 18, 8)], 1000 * m.time_boot_ms)
 
 
 def _manual_control(m: dialect.MAVLink_manual_control_message) -> Body:

@@ -139,8 +139,7 @@ class OverrideOutput(StickOutput):
         """Compare RC_CHANNELS with the sent override."""
         if isinstance(body, RcChannels) and vehicle.calibration is not None:
             pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
-            if pwm_us is not None:
-                self.echo.received(pwm_us, body.boot_us, arrived_ns)
+            self.echo.received(pwm_us, body.boot_us, arrived_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.

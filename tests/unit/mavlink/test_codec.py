@@ -140,6 +140,10 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
         m.rc_channels_encode(7, 0, *range(1001, 1019), 255),  # without a count: all are there
         RcChannels(tuple(range(1001, 1019)), boot_us=7000),
     ),
+    (
+        m.rc_channels_encode(7, 6, *range(1001, 1008), *[0] * 11, 255),  # channel 7 is overridden
+        RcChannels((*range(1001, 1008), 0), boot_us=7000),
+    ),
     *(
         (
             m.rc_channels_encode(7, 8, 800, 2200, us, *[1500] * 5, *[us] * 10, 255),
