@@ -203,16 +203,14 @@ class MavlinkLink:
 
     def _receive(self, vehicle: VehicleSession, message: ReceivedMessage, arrived_ns: int) -> None:
         """Process one message of the chosen vehicle."""
-        if isinstance(message.body, LocalVelocity) and not (
-            vehicle.condition.is_velocity_usable(arrived_ns)
-        ):
+        body, happened_ns, is_for_us = message.body, arrived_ns, True
+        if isinstance(body, LocalVelocity) and not vehicle.condition.is_velocity_usable(arrived_ns):
             self._counters.receive(f"{message.name} (invalid)", message.sequence, arrived_ns)
             vehicle.receive(message, arrived_ns)
             return
         self._counters.receive(message.name, message.sequence, arrived_ns)
-        happened_ns, is_for_us = arrived_ns, True
-        match message.body:
-            case body if isinstance(body, Measurement):
+        match body:
+            case _ if isinstance(body, Measurement):
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
                 self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
             case Timesync() as reply:
@@ -323,7 +321,11 @@ class MavlinkLink:
         waited_s, heard = (now_ns - self._started_ns) / NS_PER_S, self._connection
         if waited_s > timeout_s and not self._discovery.is_settling:
             why = self._discovery.describe(
-                parse_address(place), waited_s, heard.received_bytes, heard.received_packets
+                parse_address(place),
+                waited_s,
+                heard.received_bytes,
+                heard.received_packets,
+                heard.refusals,
             )
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 

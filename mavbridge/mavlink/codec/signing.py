@@ -91,9 +91,9 @@ class Signing:
         return unsealed + self._hash(unsealed)
 
     def accepts(self, frame: RawPacket) -> bool:
-        """True if a packet with a valid checksum is accepted; count refusals."""
+        """True if a packet is accepted; count refusals of known messages: others may be noise."""
         refusal = self._refusal(frame)
-        if refusal is not None:
+        if refusal is not None and frame.is_sound:
             self.refused[refusal] += 1
         return refusal is None
 

@@ -1,5 +1,6 @@
 """Discovery of the vehicle to fly among all senders on the link."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -132,7 +133,12 @@ class VehicleDiscovery:
         return None
 
     def describe(
-        self, address: LinkAddress, waited_s: float, received_bytes: int, received_packets: int
+        self,
+        address: LinkAddress,
+        waited_s: float,
+        received_bytes: int,
+        received_packets: int,
+        refusals: Iterable[str] = (),
     ) -> str:
         """Describe what was heard instead of the vehicle, with advice for this kind of link."""
         if self._heard_ns:
@@ -146,6 +152,8 @@ class VehicleDiscovery:
                 f"{AUTOPILOT_COMPONENT} is flown: set MAV_COMP_ID (PX4) to {AUTOPILOT_COMPONENT}, "
                 "or mend the router that changes it"
             )
+        if refused := "; ".join(refusals):
+            return refused
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "

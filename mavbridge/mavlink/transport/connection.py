@@ -148,14 +148,16 @@ class Connection:
 
     def _notice_signatures(self) -> None:
         """Report rejected signatures to the user, each kind once."""
-        signing = self._codec.signing
-        if signing is None:
-            reasons = [str(self.hint)] if self.hint else []
-        else:
-            reasons = [REFUSALS[refusal] for refusal in signing.refused]
+        reasons = self.refusals if self.hint is None else [str(self.hint)]
         for text in reasons[self._told_signatures :]:
             self._told_signatures += 1
             self.report(text)
+
+    @property
+    def refusals(self) -> list[str]:
+        """Why packets were rejected by the signature check, a sentence for each kind."""
+        signing = self._codec.signing
+        return [] if signing is None else [REFUSALS[refusal] for refusal in signing.refused]
 
     @property
     def hint(self) -> Reason | None:

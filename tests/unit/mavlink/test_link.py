@@ -24,6 +24,7 @@ from mavbridge.core.vehicle import (
     Release,
     Sample,
 )
+from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
 
@@ -136,6 +137,7 @@ class Rig:
         *,
         meaning: ActionMeaning | None = ActionMeaning(),  # noqa: B008 - frozen
         keeps_packets: bool = True,
+        signing: Signing | None = None,
         **config: Any,
     ) -> None:
         self.clock = FakeClock()
@@ -148,6 +150,7 @@ class Rig:
             LinkSettings(connect="udp:127.0.0.1:14550", **config),
             packet_log=BoundedQueue(20_000),
             keeps_packets=keeps_packets,
+            signing=signing,
         )
         if meaning is not None:
             self.link.begin_flight(meaning, None)
@@ -380,15 +383,23 @@ def test_advice_is_shown_once_and_ends_where_its_values_keep_changing() -> None:
     assert [t for t in texts if t != "lost"] == [f"RC_OVERRIDE_TIME is {k}" for k in range(100)]
 
 
-def test_noise_that_looks_like_packets_of_unknown_messages_is_no_mavlink() -> None:
-    """At a wrong baud rate half of the bytes fall into them: nobody can check their sums."""
-    rig, noise = Rig(connect_timeout_s=5.0), Random(1)
+@pytest.mark.parametrize("is_signed", [False, True])
+@pytest.mark.parametrize("sends_noise", [False, True])
+def test_without_a_vehicle_the_cause_is_told(is_signed: bool, sends_noise: bool) -> None:
+    """At a wrong baud rate half of the bytes look like packets of unknown messages: nobody can
+    check their sums."""
+    signing = Signing(bytes(32), unix_ns=lambda: EPOCH_NS) if is_signed else None
+    rig, noise = Rig(connect_timeout_s=5.0, signing=signing), Random(1)
+    unsigned = rig.vehicle.end.pack(rig.vehicle.end.mav.heartbeat_encode(6, 8, 0, 0, 4))
+    told = "no MAVLink in it" if sends_noise else "heard only GCS"
+    if is_signed and not sends_noise:
+        told = "refusing packets without a signature"
     rig.vehicle.address = None
     for _ in range(50):
-        rig.vehicle.put_bytes(noise.randbytes(600))
+        rig.vehicle.put_bytes(noise.randbytes(600) if sends_noise else unsigned)
         rig.link.receive()
         rig.link.service()
         rig.clock.advance_ns(100 * MS)
     rig.clock.advance_ns(1000 * MS)
-    with pytest.raises(PeerError, match="kB/s came, and no MAVLink in it"):
+    with pytest.raises(PeerError, match=told):
         rig.link.service()
