@@ -147,7 +147,7 @@ class Code(StrEnum):
         "leave the flag out"
     )
     SET_REFUSED = _vehicle(
-        "the vehicle did not take --set {name}={value:g}: it stays at {stays:g}; set it with your "
+        "the vehicle did not take --set {name}={value:g}: it holds {stays:g}; set it with your "
         "ground station, or leave the flag out"
     )
     CALIBRATION_UNUSABLE = _vehicle("the vehicle's radio calibration is unusable: {cause}")

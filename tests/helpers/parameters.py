@@ -84,6 +84,8 @@ class ParamVehicle:
         """Parameters whose bytes are those of an integer in the float."""
         self.refuses: set[str] = set()
         """Parameters that keep their value when set."""
+        self.rounds: set[str] = set()
+        """Parameters that hold whole numbers only."""
         self._loses = loses
         self._packets = 0
         self._answers: list[ParamValue] = []
@@ -135,5 +137,6 @@ class ParamVehicle:
             if request.kind != kind:
                 return
             read = ParamValue(name, request.value, kind)
-            self.values[name] = read.from_bytes().value
+            value = read.from_bytes().value
+            self.values[name] = round(value) if name in self.rounds else value
         yield ParamValue(name, ParamWrite(name, self.values[name], kind).as_bytes().value, kind)

@@ -67,6 +67,17 @@ def test_a_value_that_the_vehicle_does_not_take_forbids_the_flight() -> None:
     assert vehicle.values["RC_OVERRIDE_TIME"] == 0.5  # the pilot's doing, not ours
 
 
+def test_a_value_that_the_vehicle_rounds_forbids_the_flight_and_is_put_back() -> None:
+    vehicle = start(set_params=(("RC_OVERRIDE_TIME", 1.5),))
+    vehicle.rounds.add("RC_OVERRIDE_TIME")
+    vehicle.run(10.0)
+    refused = because(Code.SET_REFUSED, name="RC_OVERRIDE_TIME", value=1.5, stays=2.0)
+    assert vehicle.problem() == refused
+    end(vehicle)
+    assert vehicle.values["RC_OVERRIDE_TIME"] == 3.0
+    assert not told(vehicle, "another station")
+
+
 def test_a_vehicle_that_does_not_answer_forbids_the_flight() -> None:
     vehicle = start()
     while not vehicle.writes:

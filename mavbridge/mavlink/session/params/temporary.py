@@ -50,6 +50,8 @@ class TemporaryParams:
         self._before = before
         self._report = report
         self._failures: dict[str, Reason] = {}
+        self._altered: dict[str, float] = {}
+        """Values that the vehicle stored in place of ours: rounded, or limited to its range."""
         self._is_disarmed = self._is_ending = self._is_restoring = False
         self._open: dict[str, _Write] | None = None if wanted else {}
         """Outstanding writes; None before the first."""
@@ -141,6 +143,7 @@ class TemporaryParams:
             self._failures[name] = because(Code.SET_UNANSWERED, name=name, value=asked)
         else:
             self._failures[name] = because(Code.SET_REFUSED, name=name, value=asked, stays=answer)
+            self._altered[name] = answer
             if is_same(answer, self._before[name]):
                 del self._before[name]
 
@@ -155,8 +158,9 @@ class TemporaryParams:
     def _begin_restoring(self, values: Mapping[str, float]) -> dict[str, _Write]:
         self._is_restoring, writes = True, {}
         for name, before in list(self._before.items()):
-            now = values.get(name)
-            if now is not None and not any(is_same(now, v) for v in (before, self._wanted[name])):
+            now, wanted = values.get(name), self._wanted[name]
+            known = (before, wanted, self._altered.get(name, wanted))
+            if now is not None and not any(is_same(now, value) for value in known):
                 self._report(f"{name} was set to {now:g} by another station: it is left so")
                 del self._before[name]
             elif self._is_disarmed:
