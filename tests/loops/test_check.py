@@ -157,6 +157,14 @@ def test_what_a_flight_refuses_is_a_no_go_and_its_flag_mends_it(
     assert bench.vehicle.params[name] == value, "nothing was set"
 
 
+@pytest.mark.parametrize(("name", "value", "mended"), [("RC_OPTIONS", 2, 0), ("RC2_MIN", 700, 800)])
+def test_an_echo_that_needs_set_is_no_no_go(name: str, value: float, mended: float) -> None:
+    bench, flags = Bench(params=SAFE | {name: value}), (f"{name}={mended}",)
+    row = bench.check(contract=Contract(), set=flags, echo_test=True)["echo test"]
+    assert (row.verdict, row.commands) == ("warn", ())
+    assert "only after --set" in row.advice
+
+
 def test_without_a_receiver_its_failsafes_count() -> None:
     bench = Bench(receiver=False, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
     rows = bench.check(contract=Contract())

@@ -282,17 +282,24 @@ def _echo_row(probe: VehicleProbe, terms: Terms) -> CheckRow:
             return _link_row(name, "refused", expected, no_go=text)
         case "taken":
             return _link_row(name, "taken, and released", expected)
-    problem = probe.echo_problem
-    is_obstacle = problem is not None and problem.code is Code.OBSTACLE
+    problem, found = probe.echo_problem, f"not seen in {ECHO_S:g} s"
+    code, assessment = None if problem is None else problem.code, terms.assessment
+    is_by_params = code in (Code.OBSTACLE, Code.CALIBRATION_UNUSABLE)
+    if is_by_params and not assessment.obstacles and assessment.unusable is None:
+        text = (
+            "the vehicle takes our sticks only after --set, and the check sets nothing: a flight "
+            "does, and then waits for the echo"
+        )
+        return _link_row(name, found, expected, warn=text)
     return _link_row(
         name,
-        f"not seen in {ECHO_S:g} s",
+        found,
         expected,
         no_go=str(problem)
         if problem is not None
         else "the vehicle does not show our sticks: another station may be overriding them, or "
         "it obeys another system id",
-        commands=cures(terms.assessment.obstacles) if is_obstacle else (),
+        commands=cures(assessment.obstacles) if code is Code.OBSTACLE else (),
     )
 
 
