@@ -66,8 +66,8 @@ class StreamGroup(NamedTuple):
     """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
     set other messages."""
     least_hz: float | None = None
-    """Lowest rate of a message that is sent only on change; below it, it is requested again. None:
-    the message is periodic, and a fraction of ``rate_hz`` decides."""
+    """Rate of a message that is sent only on change, at or below which it is requested again; 0: if
+    it stays away. None: the message is periodic, and a fraction of ``rate_hz`` decides."""
     without: str = ""
     """Effect of its absence, for the user; told once."""
     stand_in: str | None = None

@@ -91,7 +91,7 @@ class _Stream:
     def is_slow(self, span_s: float) -> bool:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
-        return not self.is_given_up and self._count < least_hz * span_s
+        return not self.is_given_up and self._count <= least_hz * span_s
 
 
 def _options(group: StreamGroup) -> list[tuple[Request, float]]:

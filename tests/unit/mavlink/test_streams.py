@@ -125,14 +125,18 @@ def test_what_is_not_granted_is_asked_for_otherwise(
 @pytest.mark.parametrize(
     ("group", "message", "every", "slower", "renewals"),
     [
-        (0, "ATTITUDE_QUATERNION", 1, 25, 3),  # a ground station sets 4 Hz after three seconds
-        (4, "SYS_STATUS", 50, 10_000, 0),  # one that is only watched stops, and is not lost
+        # a ground station sets 4 Hz after three seconds
+        (ARDUPILOT.streams(state_hz=100)[0], "ATTITUDE_QUATERNION", 1, 25, 3),
+        # one that is only watched stops, and is not lost
+        (ARDUPILOT.streams(state_hz=100)[4], "SYS_STATUS", 50, 10_000, 0),
+        # an echo, which comes as seldom as sticks are sent
+        (PX4.stick_echo, "MANUAL_CONTROL", 100, 10_000, 0),
     ],
 )
 def test_a_stream_that_slows_down_is_requested_again(
-    group: int, message: str, every: int, slower: int, renewals: int
+    group: StreamGroup, message: str, every: int, slower: int, renewals: int
 ) -> None:
-    requester = StreamRequester(ARDUPILOT.streams(state_hz=100)[group : group + 1])
+    requester = StreamRequester((group,))
     requested_s = []
     for tick in range(1000):
         if tick % (every if tick < 300 else slower) == 0:
