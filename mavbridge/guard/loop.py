@@ -270,10 +270,17 @@ class GuardLoop:
         """For at most FINISH_NS, restore parameters and send an outstanding release."""
         if self._finish_until_ns is None:
             self._finish_until_ns = now_ns + FINISH_NS
-        was_clean = self._is_clean
-        self._is_clean = self._link.restore() and not self._link.is_release_owed
+        was_clean, is_restored = self._is_clean, self._link.restore()
+        self._is_clean = is_restored and not self._link.is_release_owed
         # One more pass forwards the link's messages about the parameters.
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
+        if self.is_done and not is_restored:
+            late = (
+                "what --set changed was not put back, as the vehicle did not answer within "
+                f"{FINISH_NS / NS_PER_S:g} s: set the old values, which the log has, with your "
+                "ground station"
+            )
+            self._flight.send(encode_from_guard(late))
 
     def _forward(self, arrivals: LinkArrivals) -> None:
         # The flight process does not read samples before a policy is loaded; keep the queue free.

@@ -295,6 +295,7 @@ def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
     rig.link.is_restored = seconds < 1.0
     rig.run(seconds)
     assert rig.loop.is_done
+    assert any("was not put back" in text for text in rig.texts) is (seconds > 1.0)
     took_ns = rig.clock.now_ns() - stopped_ns
     assert took_ns == pytest.approx(min(seconds * NS_PER_S, FINISH_NS), abs=40 * MS)
 
