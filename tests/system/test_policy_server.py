@@ -321,9 +321,14 @@ def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> No
         request = PolicyRequest(spec=f"ws://127.0.0.1:{port}", contract_file=path)
         contract = read_policy_contract(request)
         assert contract == replace(SMALL, play_s=0.25, max_state_age_s=0.15)
-        path.write_text("[contract]\nimage_height = 64\n")
-        with pytest.raises(PolicyError, match="contradicts the policy's own files, which say 32"):
-            read_policy_contract(request)
+        for refused, told in (
+            ("[contract]\nimage_height = 64\n", "contradicts the policy's own files, which say 32"),
+            ("[action]\nscale = [2.0, 1.0, 1.0, 1.0]\n", r"leave out \[action\]: the server"),
+            ("[state]\n[images]\n", r"leave out \[state\], \[images\]: the server"),
+        ):
+            path.write_text(refused)
+            with pytest.raises(PolicyError, match=told):
+                read_policy_contract(request)
 
 
 def test_a_served_policy_is_told_that_a_flight_begins() -> None:

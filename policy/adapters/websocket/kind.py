@@ -96,7 +96,13 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         raise ContractError(f"the server's contract cannot be used: {error}") from error
     if contract_file is None:
         return Interface(contract=contract)
-    said = read_toml(contract_file).get("contract", {})
+    file = read_toml(contract_file)
+    said = file.pop("contract", {})
+    if file:
+        raise ContractError(
+            f"--contract {contract_file}: leave out [{'], ['.join(file)}]: the server announces "
+            "its contract, and converts state, actions and images itself"
+        )
     kept = {
         field.name: getattr(contract, field.name)
         for field in fields(Contract)
