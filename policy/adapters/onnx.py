@@ -103,6 +103,7 @@ class GraphFile:
             self._output(model, result, output, pairs),
             *(model.output(pairs[n]) for n in self.hidden),
         ]
+        self._kept = [sorted(port.get_names()) for port in kept]
         self._model = ov.Model(
             [port.get_node().input_value(0) for port in kept], model.get_parameters(), "policy"
         )
@@ -117,7 +118,7 @@ class GraphFile:
             RuntimeError: OpenVINO cannot compile it.
         """
         shapes = [list(port.shape) for port in self._model.inputs]
-        subject = f"{_digest(self._path, self._model)} {shapes}"
+        subject = f"{_digest(self._path, self._model)} {shapes} {self._kept}"
         graph = compile_graph(subject, precision, lambda: self._model)
         return RoleGraph(graph, self.roles, self.hidden)
 

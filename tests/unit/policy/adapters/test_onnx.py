@@ -163,6 +163,16 @@ def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path) -> None:
     assert throttle() == pytest.approx(0.2)
 
 
+def test_another_output_of_the_same_file_is_flown(tmp_path: Path) -> None:
+    path = tmp_path / "policy.onnx"
+    nodes = [helper.make_node(kind, ["obs"], [kind]) for kind in ("Neg", "Abs")]
+    port = (graphs.FLOAT, (1, 4))
+    graphs.save_graph(path, nodes, {"obs": port}, {"Neg": port, "Abs": port}, {})
+    for output, first in (("Neg", -1.0), ("Abs", 1.0)):
+        file = GraphFile(path, {"state": Wanted(names=("obs",), shape=(1, 4))}, "chunk", output)
+        assert file.compile("f32")(state=np.ones((1, 4), np.float32))[0, 0] == first
+
+
 Write = Callable[[Path], None]
 
 
