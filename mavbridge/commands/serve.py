@@ -30,7 +30,14 @@ from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
-from policy.adapters.websocket.messages import CONTRACT_KEY, RESET_KEY, from_message, pack, unpack
+from policy.adapters.websocket.messages import (
+    CONTRACT_KEY,
+    RESET_KEY,
+    MessageError,
+    from_message,
+    pack,
+    unpack,
+)
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner, keep_nothing
@@ -92,7 +99,10 @@ class PolicyServer:
         try:
             message = unpack(request)
             image, state, history = from_message(self._interface, message)
-            if message.get(RESET_KEY):
+            begins = message.get(RESET_KEY, False)
+            if not isinstance(begins, bool):
+                raise MessageError(f"{RESET_KEY!r} must be true or false, got {begins!r:.60}")
+            if begins:
                 self._runner.reset()
             chunk = self._runner.act(image, state, history)
         except PolicyError as error:

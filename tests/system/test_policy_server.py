@@ -376,6 +376,7 @@ def test_our_server_keeps_the_protocol_of_openpi() -> None:
             (b"garbage", "not a msgpack map"),
             (pack({"observation/image": 1}), "no 'observation.images.front' in it"),
             (pack({**request, "observation.state": np.zeros(3)}), "[13]"),
+            (pack({**request, "reset": np.array([1, 1])}), "'reset' must be true or false"),
             ("text", "a text in place"),
             (pack(request), None),
         ):

@@ -120,13 +120,15 @@ def number_array(message: Message, key: str) -> NDArray[np.generic]:
     """Return an array, or a list of numbers, of a message as an array."""
     if key not in message:
         raise MessageError(f"no {key!r} in it; it has {sorted(message)}")
+    value = message[key]
+    if isinstance(value, np.ndarray | np.generic):
+        return np.asarray(value)
     try:
-        array = np.asarray(message[key])
-    except ValueError as error:
-        raise MessageError(f"{key!r} is no array: {error}") from error
-    if array.dtype.kind not in "biuf":
-        raise MessageError(f"{key!r} is no array of numbers but {type(message[key]).__name__}")
-    return array
+        # Without a dtype, each text of a list would take the room of the longest: terabytes.
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        told = f"{type(value).__name__}: {last_line(error)}"
+        raise MessageError(f"{key!r} is no array of numbers but {told}") from error
 
 
 def to_message(
@@ -183,7 +185,8 @@ def _array(
 ) -> NDArray[np.generic]:
     """Return an array of the request; its first ``finite`` rows, or all, must be finite."""
     array = number_array(message, key)
-    if array.dtype.kind != kind or array.shape != shape:
+    is_kind = array.dtype == np.uint8 if kind == "u" else array.dtype.kind == kind
+    if not is_kind or array.shape != shape:
         wanted = "uint8" if kind == "u" else "float32"
         raise MessageError(
             f"{key!r} must be {wanted} {list(shape)}, got {array.dtype} {list(array.shape)}"

@@ -149,6 +149,8 @@ def test_errors_name_what_is_there() -> None:
         number_array({"actions": "left"}, "actions")
     with pytest.raises(MessageError, match="'actions' is no array"):
         number_array({"actions": [[1, 2], [3]]}, "actions")
+    with pytest.raises(MessageError, match="'actions' is no array"):  # as texts of numpy: 2 TB
+        number_array({"actions": ["a" * 700_000, *["b"] * 700_000]}, "actions")
     with pytest.raises(MessageError, match="KeyError: 'image'"):
         unpack("Traceback (most recent call last):\n  File x\nKeyError: 'image'\n")
     with pytest.raises(MessageError, match=r"\(nothing\)"):
@@ -229,6 +231,7 @@ def test_keys_and_names_are_those_of_the_contract_file() -> None:
         ({"observation.state": np.full(13, np.nan, np.float32)}, "NaN"),
         ({"action_history": np.full((4, 4), np.nan, np.float32)}, "NaN"),
         ({"observation.images.front": np.zeros((16, 24, 3), np.float32)}, "uint8"),
+        ({"observation.images.front": np.zeros((16, 24, 3), np.uint16)}, "uint8"),
         ({"observation.images.front": np.zeros((3, 16, 24), np.uint8)}, r"\[16, 24, 3\]"),
     ],
 )
