@@ -214,10 +214,12 @@ def test_what_is_no_chunk_is_refused_at_loading_and_coasted_over_in_flight(
         ("[]", "not a JSON object"),
         ("{", "not JSON"),
         ("[" * 100_000, "nested too deeply"),
+        ({"horizon": 4}, "mavbridge_fields must be JSON as text, got a dict"),
+        (b"{}", "mavbridge_fields must be JSON as text, got a bytes"),
     ],
 )
 def test_a_server_may_say_fields_that_the_file_lacks(
-    contract_file: Path, fields: str, told: str | None
+    contract_file: Path, fields: object, told: str | None
 ) -> None:
     greeting = pack({"mavbridge_fields": fields})
     with scripted_server(lambda _: pack({"actions": [[0.5] * 4] * 4}), greeting=greeting) as port:
@@ -247,10 +249,15 @@ def test_addresses_without_a_policy_server(
             pytest.raises(PolicyError, match="is no policy server, its first message"),
         ):
             load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
-    with scripted_server(lambda _: chunk_of(0.5)) as port:
-        url = f"ws://127.0.0.1:{port}"
-        with pytest.raises(PolicyError, match="give --contract FILE; docs"):
-            read_policy_contract(PolicyRequest(spec=url))
+    for metadata, told in (
+        ({}, "give --contract FILE; docs/policy_server.md"),
+        ({"mavbridge_contract": {}}, "mavbridge_contract must be JSON as text, got a dict"),
+    ):
+        with (
+            scripted_server(lambda _: chunk_of(0.5), greeting=pack(metadata)) as port,
+            pytest.raises(PolicyError, match=told),
+        ):
+            read_policy_contract(PolicyRequest(spec=f"ws://127.0.0.1:{port}"))
 
 
 def test_the_deadline_is_what_the_guard_would_fly() -> None:

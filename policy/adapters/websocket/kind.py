@@ -80,15 +80,14 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
     the fields that the server knows."""
     from policy.adapters.websocket.messages import CONTRACT_KEY, FIELDS_KEY
 
-    served = metadata.get(CONTRACT_KEY)
-    if not isinstance(served, str):
+    served = _json_text(metadata, CONTRACT_KEY)
+    if served is None:
         if contract_file is not None:
-            known = metadata.get(FIELDS_KEY)
-            text = known if isinstance(known, str) else "{}"
+            text = _json_text(metadata, FIELDS_KEY) or "{}"
             return read_interface(contract_file, parse_object(text, ContractError, FIELDS_KEY))
         raise PolicyError(
             "the server does not say its rate nor what its state and actions mean: write that in a "
-            "file, and give --contract FILE; docs/policy.md has one to begin with"
+            "file, and give --contract FILE; docs/policy_server.md has an example"
         )
     try:
         contract = replace(Contract.from_json(served), arrays="numpy", feature_dim=0)
@@ -109,3 +108,11 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         if field.init and not (field.name in TERMS and field.name in said)
     }
     return read_interface(contract_file, kept)
+
+
+def _json_text(metadata: "Message", key: str) -> str | None:
+    """Return a JSON text of the server's metadata; None if it is not there."""
+    text = metadata.get(key)
+    if text is None or isinstance(text, str):
+        return text
+    raise ContractError(f"the server's {key} must be JSON as text, got a {type(text).__name__}")
