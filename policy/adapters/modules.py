@@ -56,6 +56,7 @@ def adopt_modules(
             return None
         call = _Call(name, holder, "chunk", picks)
         call.skip = int(_takes_no_image(call, interface, (inputs or {}).get("state")))
+        call.require_order("image", "state", "action_history")
         return _with_life(ForwardPolicy(interface, call, modules), holder)
     if encoder is None or (head is None) == (denoiser is None):
         raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
@@ -69,9 +70,11 @@ def adopt_modules(
     interface = _with_feature(name, encode, interface)
     if head is not None:
         call = _Call(name, head, "chunk", picks)
+        call.require_order("feature", "state", "action_history")
         return _with_life(HeadPolicy(interface, encode, call, modules), holder)
     schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
     call = _Call(name, denoiser, "prediction", picks)
+    call.require_order("noisy", "timestep", "feature", "state", "action_history")
     policy = DenoiserPolicy(interface, encode, call, schedule, seed, modules)
     return _with_life(policy, holder)
 
@@ -279,6 +282,17 @@ class _Call:
         self.names = list(parameters)
         takes_any = any(each.kind is each.VAR_POSITIONAL for each in parameters.values())
         self._count = sys.maxsize if takes_any else len(parameters)
+
+    def require_order(self, *roles: str) -> None:
+        """Raise PolicyError if an argument has the usual name of another role than its own."""
+        places = {name: at for at, role in enumerate(roles) for name in USUAL_NAMES[role]}
+        for at, name in enumerate(self.names, self.skip):
+            if places.get(name, at) != at:
+                raise PolicyError(
+                    f"{self._name}: its {self._result} is made from {', '.join(roles)}, passed in "
+                    f"this order, but the arguments are {', '.join(self.names)}: reorder or rename "
+                    "them"
+                )
 
     def __call__(self, *arguments: Tensor) -> Tensor:
         returned: object = self._function(*arguments[self.skip :][: self._count])

@@ -124,6 +124,23 @@ def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     assert [act(runner, vx_mps=vx)[0, 0] for vx in (1.0, -1.0)] == [0.5, 0.0]
 
 
+class StateFirst(nn.Module):
+    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 8, 4) + state.mean() + image.mean()
+
+
+class NoState(nn.Module):
+    def forward(self, image: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 8, 4) + image.mean() + history.mean()
+
+
+@pytest.mark.parametrize("module", [StateFirst(), NoState()])
+def test_arguments_in_another_order_are_refused(tmp_path: Path, module: nn.Module) -> None:
+    path = archive(tmp_path, module, described())
+    with pytest.raises(PolicyError, match="image, state, action_history, passed in this order"):
+        load(f"torchscript:{path}")
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
