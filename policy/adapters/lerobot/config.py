@@ -251,7 +251,7 @@ def _feature(path: Path, key: str, value: object) -> tuple[str, tuple[int, ...]]
 
 
 def _are_counts(value: Any) -> bool:
-    return isinstance(value, list) and all(type(n) is int and n > 0 for n in value)
+    return isinstance(value, list) and value != [] and all(type(n) is int and n > 0 for n in value)
 
 
 _KINDS: dict[object, tuple[str, Callable[[Any], bool]]] = {

@@ -22,7 +22,7 @@ from policy.adapters.lerobot.config import (
     read_config,
     read_json,
 )
-from policy.contract import Contract, FloatArray
+from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.errors import CheckpointError, ContractError, warned
 from policy.files import open_safetensors
 
@@ -37,6 +37,15 @@ MODES: dict[str, tuple[str, ...]] = {
 }
 """Statistics that each normalisation mode needs."""
 _HARMLESS = ("to_batch_processor", "device_processor")
+_STEP = {
+    "config": dict,
+    "rename_map": dict | None,
+    "norm_map": dict | None,
+    "normalize_observation_keys": list | None,
+    "eps": float | int | None,
+    "state_file": str | None,
+}
+"""Types of the entries of a processor's step that are read; None: it may be missing."""
 _EPSILON = 1e-8
 _CONSTANT = 1e-6
 """A number of the state that varied by less counts as constant."""
@@ -78,9 +87,10 @@ class _Statistics:
     epsilon: float
     arrays: Mapping[str, Mapping[str, FloatArray]]
 
-    def affine(self, key: str, kind: str, notes: list[str]) -> Affine | None:
-        """Return the transformation of one feature; None: unchanged, noted if it is asked for."""
-        mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
+    def affine(self, key: str, kind: str, size: int, notes: list[str]) -> Affine | None:
+        """Return the transformation of a feature of ``size`` numbers or channels; None: unchanged,
+        noted if it is asked for."""
+        mode, own = str(self.modes.get(kind, "IDENTITY")), self.arrays.get(key, {})
         if mode not in MODES:
             raise CheckpointError(
                 f"{self.path}: normalises {key} by {mode!r}; supported are {', '.join(MODES)}"
@@ -93,6 +103,10 @@ class _Statistics:
             raise CheckpointError(
                 f"{self.path}: {key} is normalised by {mode}, but its statistics lack {missing}; "
                 f"there are {sorted(own)}"
+            )
+        if sizes := {name: n for name in MODES[mode] if (n := own[name].size) != size}:
+            raise CheckpointError(
+                f"{self.path}: each statistic of {key} must have {size} numbers, got {sizes}"
             )
         shape = (3, 1, 1) if kind == "VISUAL" else (-1,)
         low, high = (own[name].astype(np.float32).reshape(shape) for name in MODES[mode])
@@ -115,16 +129,17 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor", features)
     outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor", features)
     notes: list[str] = []
-    state = inputs.affine(STATE_KEY, "STATE", notes) if features.state_dim else None
+    width = features.state_dim
+    state = inputs.affine(STATE_KEY, "STATE", width, notes) if width else None
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
         told = f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training data"
         notes.append(
             warned(f"{told}: as in LeRobot, any other value is divided by almost 0 and dominates")
         )
     normalisation = Normalisation(
-        images={key: inputs.affine(key, "VISUAL", notes) for key in features.image_keys},
+        images={key: inputs.affine(key, "VISUAL", 3, notes) for key in features.image_keys},
         state=state,
-        action=outputs.affine(ACTION_KEY, "ACTION", notes),
+        action=outputs.affine(ACTION_KEY, "ACTION", ACTION_DIM, notes),
         renamed=renamed,
     )
     return normalisation, notes
@@ -141,6 +156,9 @@ def _processor(
         raise CheckpointError(f"{path}: no list of steps")
     for step in steps:
         name, config = step.get("registry_name", step.get("class")), step.get("config", {})
+        entries = {"config": config, **step, **(config if isinstance(config, dict) else {})}
+        if wrong := [key for key, kind in _STEP.items() if not isinstance(entries.get(key), kind)]:
+            raise CheckpointError(f"{path}: the step {name!r} has malformed entries {wrong}")
         if name == "rename_observations_processor":
             renamed |= config.get("rename_map", {})
         elif name == normaliser:
@@ -249,7 +267,7 @@ def _policy_cameras(
     path: Path, interface: Interface, features: Features, normalisation: Normalisation
 ) -> tuple[int, ...]:
     known = features.image_keys
-    keys = [normalisation.renamed.get(key, key) for key in interface.camera_keys]
+    keys = [str(normalisation.renamed.get(key, key)) for key in interface.camera_keys]
     if not interface.image_keys and len(known) == len(keys) == 1:
         return (0,)  # one camera on both sides: names do not matter
     if sorted(keys) != sorted(known):

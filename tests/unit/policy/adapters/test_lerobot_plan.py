@@ -1,6 +1,7 @@
 """What a LeRobot folder and a contract file say, and what is refused before weights are read."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -59,6 +60,7 @@ def test_the_contract_has_what_the_files_say(folder, tmp_path_factory):
         ({"prediction_type": "v_prediction"}, "prediction_type must be one of epsilon, sample"),
         ({"use_group_norm": None}, "no entry 'use_group_norm', and its default differs"),
         ({"down_dims": [16, 32, 64, 128]}, "a horizon of 8 does not suit"),
+        ({"down_dims": []}, "down_dims must be positive integers"),
         ({"crop_shape": [65, 65]}, "cannot crop"),
         ({"kernel_size": True}, "kernel_size must be a positive integer"),
         ({"clip_sample": 1}, "clip_sample must be true or false"),
@@ -164,7 +166,31 @@ def test_processors_that_are_not_supported_are_refused(folder):
     save_file({k: v for k, v in load_file(path).items() if not k.endswith("state.max")}, path)
     with pytest.raises(CheckpointError, match=r"observation.state is normalised by MIN_MAX.*'max'"):
         read_plan(folder, None)
+    for key, size in (
+        ("observation.state.min", 1),
+        ("observation.state.min", 14),
+        (FRONT + ".mean", 1),
+    ):
+        shutil.copy(GOLDENS / "diffusion" / STATISTICS, path)
+        save_file(load_file(path) | {key: np.zeros(size, np.float32)}, path)
+        with pytest.raises(CheckpointError, match=rf"must have \d+ numbers, got .*: {size}"):
+            read_plan(folder, None)
     step = {"registry_name": "relative_actions_processor", "config": {}}
     edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
     with pytest.raises(CheckpointError, match="relative_actions_processor"):
+        read_plan(folder, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"config": None}, "malformed entries ['config']"),
+        ({"state_file": 3}, "malformed entries ['state_file']"),
+        ({"config": {"eps": "x", "norm_map": []}}, "malformed entries ['norm_map', 'eps']"),
+        ({"config": {"norm_map": {"STATE": ["a"]}}}, "normalises observation.state by \"['a']\""),
+    ],
+)
+def test_a_malformed_step_of_a_processor_is_refused(folder, change, said):
+    edit(folder / "policy_preprocessor.json", lambda data: data["steps"][3].update(change))
+    with pytest.raises(CheckpointError, match=re.escape(said)):
         read_plan(folder, None)
