@@ -260,6 +260,11 @@ class OnnxGraphs:
             image = replace(wanted["image"], shape=(1, *contract.image_shape[-3:]))
             output = description.outputs.get("feature")
             self._encoder = GraphFile(files.encoder, {"image": image}, "feature", output)
+            if self._encoder.hidden:  # its calls and the reset run in two threads
+                raise PolicyError(
+                    f"{files.encoder}: an encoder cannot have a hidden state, got "
+                    f"{list(self._encoder.hidden)}: keep it in the head, or export one policy.onnx"
+                )
             contract = _with_feature(contract, self._encoder, files.encoder)
             wanted["feature"] = replace(wanted["feature"], shape=(1, *contract.feature_shape))
             seen = "feature"

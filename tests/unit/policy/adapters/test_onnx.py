@@ -251,6 +251,17 @@ def one_node(
     )
 
 
+def recurrent_encoder(folder: Path) -> None:
+    port = (graphs.FLOAT, IMAGE)
+    nodes = [
+        helper.make_node("Add", ["image", "h_in"], ["h_out"]),
+        helper.make_node("Neg", ["h_out"], ["feature"]),
+    ]
+    path, outputs = folder / "encoder.onnx", {"feature": port, "h_out": port}
+    graphs.save_graph(path, nodes, {"image": port, "h_in": port}, outputs, {})
+    (folder / "head.onnx").touch()
+
+
 class Deep(nn.Module):
     """Fails inside of torch."""
 
@@ -286,6 +297,10 @@ REFUSED: dict[str, tuple[Write, str]] = {
             graphs.describe(folder, hidden={"h_in": "actions"}),
         ],
         r"h_in is \[1, 1, 3\] and its output actions \[1, 4\]",
+    ),
+    "recurrent encoder": (
+        recurrent_encoder,
+        r"encoder\.onnx: an encoder cannot have a hidden state, got \['h_in'\]",
     ),
     "no such output": (
         lambda folder: [
