@@ -181,37 +181,44 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
     ``derived`` are contract fields that the policy's own files set. The contract file may repeat
     them but not contradict them.
     """
-    try:
-        data: dict[str, Any] = read_toml(path)
-    except OSError as error:
-        raise ContractError(f"--contract {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise ContractError(f"--contract {path} is not TOML: {error}") from error
+    data = read_tables(path)
     try:
         return _interface(data, derived or {})
     except (ContractError, TypeError, ValueError) as error:
         raise ContractError(f"--contract {path}: {error}") from error
 
 
-def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
+def read_tables(path: Path) -> dict[str, Any]:
+    """Read a contract file's tables; their values are checked only for unanswered questions."""
+    try:
+        data: dict[str, Any] = read_toml(path)
+    except OSError as error:
+        raise ContractError(f"--contract {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ContractError(f"--contract {path} is not TOML: {error}") from error
+    if loose := [name for name, entries in data.items() if not isinstance(entries, dict)]:
+        raise ContractError(f"--contract {path}: {loose} must stand in a table, as in [contract]")
     if unanswered := [
         f"[{table}] {name}"
         for table, entries in data.items()
-        if isinstance(entries, dict)
         for name, value in entries.items()
         if is_unanswered(value)
     ]:
         raise ContractError(
-            f"this is a draft, in which {len(unanswered)} answers are missing: "
+            f"--contract {path}: this is a draft, in which {len(unanswered)} answers are missing: "
             f"{', '.join(unanswered)}. Replace each {UNANSWERED!r} there, by what the comment asks"
         )
+    return data
+
+
+def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
     tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
     task = dict(data.pop("task", {}))
-    pairs = tables["contract"].items()
-    said: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in pairs
-    }
-    for name, value in derived.items():
+    said, known = (
+        {name: tuple(value) if isinstance(value, list) else value for name, value in each.items()}
+        for each in (tables["contract"], derived)
+    )
+    for name, value in known.items():
         if said.setdefault(name, value) != value:
             raise ContractError(
                 f"[contract] {name} = {said[name]!r} contradicts the policy's own files, which say "

@@ -1,5 +1,6 @@
 """Policies on servers: real sockets on loopback, every wait with a deadline."""
 
+import json
 import os
 import signal
 import socket
@@ -46,6 +47,7 @@ PATIENT_S = 20.0
 """Longest wait of a test for something that another thread does."""
 CONTRACT = """
 [contract]
+modes = ["LOITER"]
 image_height = 32
 image_width = 32
 max_state_age_s = 0.5
@@ -208,7 +210,7 @@ def test_what_is_no_chunk_is_refused_at_loading_and_coasted_over_in_flight(
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        ('{"horizon": 4, "image_height": 32}', None),
+        ('{"horizon": 4, "image_height": 32, "modes": ["LOITER"]}', None),
         ('{"image_height": 48}', "image_height = 32 contradicts"),
         ('{"height": 48}', "unknown contract keys"),
         ("[]", "not a JSON object"),
@@ -331,11 +333,19 @@ def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> No
         for refused, told in (
             ("[contract]\nimage_height = 64\n", "contradicts the policy's own files, which say 32"),
             ("[action]\nscale = [2.0, 1.0, 1.0, 1.0]\n", r"leave out \[action\]: the server"),
+            ("contract = 3\n", r"\['contract'\] must stand in a table"),
             ("[state]\n[images]\n", r"leave out \[state\], \[images\]: the server"),
         ):
             path.write_text(refused)
             with pytest.raises(PolicyError, match=told):
                 read_policy_contract(request)
+    served = json.dumps({"action": "rates", "horizon": 100, "image_height": 32})
+    greetings = {"mavbridge_contract": served}, {"mavbridge_fields": served}
+    path.write_text('[contract]\nmodes = ["OFFBOARD"]\nplay_s = 2.0\n')
+    for greeting in map(pack, greetings):
+        with scripted_server(lambda _: chunk_of(0.5, horizon=100), greeting=greeting) as port:
+            contract = read_policy_contract(replace(request, spec=f"ws://127.0.0.1:{port}"))
+            assert (contract.modes, contract.play_s, contract.horizon) == (("OFFBOARD",), 2.0, 100)
 
 
 def test_a_served_policy_is_told_that_a_flight_begins() -> None:

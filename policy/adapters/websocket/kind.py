@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from policy.adapters.interface import Interface, read_interface
+from policy.adapters.interface import Interface, read_interface, read_tables
 from policy.contract import LIMIT_TERMS, Contract
 from policy.errors import ContractError, PolicyError
-from policy.files import parse_object, read_toml
+from policy.files import parse_object
 
 if TYPE_CHECKING:
     from policy.adapters.websocket.messages import Message
@@ -51,7 +51,7 @@ def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) 
             f"--policy {url}: the server has the weights; leave out --checkpoint {checkpoint}"
         )
     if contract_file is not None:
-        read_interface(contract_file)
+        read_tables(contract_file)  # only the server knows which values are right
 
 
 def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
@@ -95,7 +95,7 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         raise ContractError(f"the server's contract cannot be used: {error}") from error
     if contract_file is None:
         return Interface(contract=contract)
-    file = read_toml(contract_file)
+    file = read_tables(contract_file)
     said = file.pop("contract", {})
     if file:
         raise ContractError(
