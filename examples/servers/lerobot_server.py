@@ -80,5 +80,6 @@ if __name__ == "__main__":
     parser.add_argument("--rtc", type=float, metavar="DT")
     flags = parser.parse_args()
     answer = Server(flags.folder, flags.rtc).answer
-    with serve(answer, flags.host, flags.port, compression=None) as listening:
+    images = {"compression": None, "max_size": None}  # two of 640x480 exceed the usual 1 MiB
+    with serve(answer, flags.host, flags.port, **images) as listening:
         listening.serve_forever()

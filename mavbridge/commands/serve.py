@@ -74,7 +74,8 @@ class PolicyServer:
         self._runner = runner
         self._clock = clock
         self._interface = Interface(contract=runner.contract)
-        self._max_bytes = math.prod(runner.contract.image_shape) + SPARE_BYTES
+        pixel_bytes = 4 if runner.contract.is_depth else 1
+        self._max_bytes = pixel_bytes * math.prod(runner.contract.image_shape) + SPARE_BYTES
         self._api_key = api_key
         self._report = report
         self._clients = 0

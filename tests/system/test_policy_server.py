@@ -422,6 +422,10 @@ def test_our_server_bounds_clients_and_requests() -> None:
         url = f"http://127.0.0.1:{port}/healthz"
         with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url) as response:
             assert (response.status, response.read()) == (200, b"OK\n")
+    depth = replace(SMALL, image_channels="depth", image_height=640, image_width=960)
+    runner = replace(served_echo(), contract=depth, act=lambda *_: np.zeros((1, 16, 4), np.float32))
+    with our_server(runner) as port:  # 2.5 MB of float32 an image
+        assert read_policy_contract(PolicyRequest(spec=f"ws://127.0.0.1:{port}")) == depth
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:8000", ""])
