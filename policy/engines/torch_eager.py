@@ -6,6 +6,7 @@ And what a user's policy holds: its modules, and the attributes that change from
 from collections.abc import Collection
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -47,8 +48,9 @@ def modules_of(policy: object) -> list[nn.Module]:
 def snapshot(policy: object) -> dict[str, object]:
     """Return the attributes of a policy and of all its modules, by name, in a comparable form.
 
-    Tensors are compared by value, except the weights, which no forward call changes; numbers and
-    texts by value; collections by the identity of their elements; other objects by identity.
+    Tensors are compared by value, except the weights, which no forward call changes; numpy arrays,
+    numbers and texts by value; collections by the identity of their elements; other objects by
+    identity.
     """
     holders: dict[str, object] = {"": policy}
     for at, module in enumerate(modules_of(policy)):
@@ -73,6 +75,8 @@ def _mark(value: object) -> object:
     if isinstance(value, Tensor):
         array = value.detach().cpu().contiguous()
         return str(array.dtype), tuple(array.shape), array.float().numpy().tobytes()
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
     if value is None or isinstance(value, bool | int | float | str | bytes):
         return value
     if isinstance(value, dict):
