@@ -68,6 +68,9 @@ def describe(
     for name, known in (("inputs", USUAL_NAMES), ("outputs", RESULTS)):
         if unknown := sorted(set(rest[name]) - set(known)):
             raise CheckpointError(f"{where}: {name} {unknown} are unknown; known are {list(known)}")
+    for name in ("inputs", "outputs", "hidden"):
+        if wrong := {k: v for k, v in rest[name].items() if not isinstance(v, str | int)}:
+            raise CheckpointError(f"{where}: {name} must be single names, got {wrong}")
     if contract_file is not None:
         return Description(interface=read_interface(contract_file), **rest)
     if "contract" in data:

@@ -131,6 +131,8 @@ def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
         (("policy.onnx",), '{"colour": 1}', r"must be an object of \['contract'"),
         (("policy.onnx",), '{"contract": {"horizon": 0}}', "horizon must be an integer"),
         (("policy.onnx",), '{"inputs": {"depth": "d"}}', "inputs .'depth'. are unknown"),
+        (("policy.onnx",), '{"inputs": {"state": ["x"]}}', "inputs must be single names, got"),
+        (("policy.onnx",), '{"hidden": {"h": null}}', "hidden must be single names, got"),
         (("encoder.onnx", "denoiser.onnx"), '{"contract": {}}', "needs the noise schedule"),
     ],
 )
