@@ -338,7 +338,7 @@ class OnnxGraphs:
                 settings=settings,
                 compile_end=run,
             )
-            return replace(runner, reset=reset)
+            return replace(runner, reset=reset) if self._rest.hidden else runner
 
         reference, samples = runner_of("f32", "f32"), make_parity_samples(self.interface.contract)
         faster = [
