@@ -47,8 +47,11 @@ class Wanted:
 class RoleGraph:
     """Compiled graph with its hidden state, zeros at first; for one thread."""
 
-    def __init__(self, graph: Graph, roles: list[str], hidden: Mapping[str, Shape]) -> None:
+    def __init__(
+        self, graph: Graph, roles: list[str], hidden: Mapping[str, Shape], *, has_scalar_time: bool
+    ) -> None:
         self._graph, self._roles, self._hidden_shapes = graph, roles, hidden
+        self._has_scalar_time = has_scalar_time
         self.reset()
 
     def reset(self) -> None:
@@ -59,6 +62,8 @@ class RoleGraph:
     def __call__(self, **arrays: FloatArray) -> FloatArray:
         """Run the graph on float32 arrays by role; arrays that it does not take are ignored."""
         given = arrays | self._hidden if self._hidden else arrays
+        if self._has_scalar_time:
+            given = {**given, "timestep": given["timestep"].reshape(())}
         result = self._graph(*[given[role] for role in self._roles])
         if self._hidden:
             self._hidden = dict(zip(self._hidden, self._graph.rest(), strict=True))
@@ -120,7 +125,8 @@ class GraphFile:
         shapes = [list(port.shape) for port in self._model.inputs]
         subject = f"{_digest(self._path, self._model)} {shapes} {self._kept}"
         graph = compile_graph(subject, precision, lambda: self._model)
-        return RoleGraph(graph, self.roles, self.hidden)
+        has_scalar_time = dict(zip(self.roles, shapes, strict=True)).get("timestep") == []
+        return RoleGraph(graph, self.roles, self.hidden, has_scalar_time=has_scalar_time)
 
     def _hidden_pairs(self, model: "ov.Model", given: Mapping[str, str]) -> dict[str, str]:
         """Return the output that feeds each hidden input at the next call, by name."""

@@ -212,6 +212,20 @@ def test_state_and_actions_are_in_the_order_and_units_of_the_contract_file(tmp_p
     assert sticks == pytest.approx([0.3, 0.6, 0.6, 0.6], abs=1e-3)
 
 
+def test_a_timestep_without_axes_is_taken(tmp_path: Path) -> None:
+    graphs.write_contract(tmp_path, horizon=8)
+    graphs.describe(tmp_path, schedule={"prediction": "sample"})
+    graphs.image_actor(tmp_path / "encoder.onnx")
+    chunk = (graphs.FLOAT, (1, 8, 4))
+    nodes = [
+        helper.make_node("Cast", ["timestep"], ["time"], to=graphs.FLOAT),
+        helper.make_node("Mul", ["noisy", "time"], ["out"]),
+    ]
+    inputs = {"noisy": chunk, "timestep": (TensorProto.INT64, ())}
+    graphs.save_graph(tmp_path / "denoiser.onnx", nodes, inputs, {"out": chunk}, {})
+    assert act(load(f"onnx:{tmp_path}", num_diffusion_steps=1).runner)[0, 0] in (-1, 1)
+
+
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
 def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.write_contract(tmp_path)
