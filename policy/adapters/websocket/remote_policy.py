@@ -115,8 +115,11 @@ class RemotePolicy:
             actions = actions[0]
         wanted = (self.contract.horizon, ACTION_DIM)
         if actions.shape != wanted:
+            advice = "set [contract] horizon to what the server returns"
+            if actions.shape[1:] != wanted[1:]:
+                advice = "the server has to cut out the four numbers that fly a multirotor"
             raise MessageError(
                 f"actions {list(actions.shape)} where the contract has [horizon, 4] = "
-                f"{list(wanted)}: set [contract] horizon to what the server returns"
+                f"{list(wanted)}: {advice}"
             )
         return self._interface.to_actions(actions.astype(np.float32))[None]
