@@ -22,7 +22,7 @@ from policy.contract import (
 )
 from policy.engines.runner import EngineName, ExecutionSettings, encode_all
 from policy.engines.torch_eager import changes, make_torch_runner, modules_of, snapshot
-from policy.errors import Agreed, PolicyError, warned
+from policy.errors import Agreed, NoChunkError, PolicyError, warned
 from policy.nets.toge import BuiltinPolicy
 from policy.preprocess import SINCE_EXPOSURE_SCALE
 from policy.protocol import PolicyRunner, SingleRatePolicy
@@ -136,7 +136,11 @@ def first_that_agrees(
         samples = make_parity_samples(policy.contract)
         reference = make_torch_runner(policy, on_cpu)
         before = snapshot(policy)
-        expected = chunks_of_samples(reference, samples)
+        try:
+            expected = chunks_of_samples(reference, samples)
+        except NoChunkError as error:
+            note = f"engine torch: it has no chunk for a sample, which a graph cannot say: {error}"
+            return make_torch_runner(policy, settings), (note,)
         if (reason := _impurity(policy, before, reference, samples, expected)) is not None:
             return make_torch_runner(policy, settings), (f"engine torch: {reason}",)
         runner, notes = first_with_chunks(expected, samples, candidates)

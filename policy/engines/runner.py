@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
-from policy.errors import PolicyError, user_code
+from policy.errors import NoChunkError, PolicyError, user_code
 from policy.preprocess import image_to_input
 from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, StepwisePolicy
 
@@ -239,6 +239,8 @@ def _try(runner: PolicyRunner) -> None:
                 _require(runner, "encode_visual", feature, (1, contract.feature_dim))
         encoded = encode_all(runner, images)
         chunk = runner.act(encoded, state, history)
+    except NoChunkError:
+        return  # it may have one for the next state
     except PolicyError as error:
         told = str(error) if runner.name in str(error) else f"{runner.name}: {error}"
         raise PolicyError(

@@ -53,6 +53,17 @@ def test_a_file_of_the_users_flies_and_finds_its_neighbours(folder: Path, form: 
     assert "flying" not in sys.modules
 
 
+@pytest.mark.parametrize("arrays", ["numpy", "torch"])
+def test_a_policy_without_a_chunk_for_the_first_states_is_loaded(folder, arrays):
+    code = FLYING.replace("return", "raise NoChunkError('too early') #")
+    code = code.replace("self.value =", "self.net, self.value = torch.nn.Linear(1, 1),")
+    code = "import torch\nfrom policy.errors import NoChunkError\n" + code
+    code = code.replace('"numpy"', f'"{arrays}"')
+    (folder / "flying.py").write_text(code)
+    loaded = load("./flying.py:Flying")
+    assert (loaded.runner.engine, loaded.times) == (arrays, None)
+
+
 def test_files_of_one_name_are_two_policies(folder: Path) -> None:
     for name, value in (("first", 0.1), ("second", 0.2)):
         (folder / name).mkdir()
