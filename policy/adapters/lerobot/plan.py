@@ -244,9 +244,15 @@ def _interface(path: Path, config: Config) -> Interface:
         "feature_dim": config.feature_dim,
         "observation_steps": config.n_obs_steps,
         "horizon": config.horizon,
+        "prefix_len": 0,
     }
     interface = read_interface(path, derived)
     contract: Contract = interface.contract
+    if contract.observation_dt_s not in (Contract.observation_dt_s, contract.chunk_dt_s):
+        raise ContractError(
+            f"{path}: [contract] observation_dt_s = {contract.observation_dt_s}: LeRobot's "
+            f"observations are chunk_dt_s = {contract.chunk_dt_s} apart: leave it out"
+        )
     return replace(interface, contract=replace(contract, observation_dt_s=contract.chunk_dt_s))
 
 

@@ -138,6 +138,8 @@ def test_a_missing_file_is_named(folder, file, said):
     ("contract", "said"),
     [
         ("image_height = 224", "image_height = 224 contradicts .* 64"),
+        ("prefix_len = 3", "prefix_len = 3 contradicts .* 0"),
+        ("observation_dt_s = 0.5", "observations are chunk_dt_s = 0.1 apart"),
         ("horizon = 16", "horizon = 16 contradicts .* 7"),
         ('cameras = ["front", "down"]', r"policy's images are \['observation.images.front'\]"),
         ('[state]\nnames = ["vx_mps", "qw"]', "takes a state of 13 numbers, and these are 2"),
