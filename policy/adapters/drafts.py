@@ -101,8 +101,8 @@ def draft_text(title: str, entries: Sequence[Entry]) -> str:
             comment = _comment(f"{entry.origin.upper()}: {entry.why}")
             lines += comment if comment != said else []
             said = comment
-            # JSON strings, numbers and lists are valid TOML.
-            line = f"{entry.name} = {json.dumps(entry.value)}"
+            # JSON strings, numbers and lists are valid TOML, but not JSON's pairs of surrogates.
+            line = f"{entry.name} = {json.dumps(entry.value, ensure_ascii=False)}"
             lines.append(f"# {line}" if entry.origin == "optional" else line)
     return "\n".join(lines) + "\n"
 
@@ -349,7 +349,8 @@ def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
 def _camera_entries(keys: Sequence[str], where: str) -> list[Entry]:
     """Draft the policy's name of each camera."""
     cameras = ["front"] if len(keys) == 1 else [key.rpartition(".")[2] for key in keys]
-    if len(set(cameras)) < len(keys) or not all(name.isidentifier() for name in cameras):
+    is_bare = all(name.isidentifier() and name.isascii() for name in cameras)
+    if len(set(cameras)) < len(keys) or not is_bare:
         cameras = [f"camera_{number}" for number in range(len(keys))]
     why = "names of the vehicle's cameras; with several, those that --camera gives them"
     images = [

@@ -117,6 +117,7 @@ def test_one_unknown_name_leaves_the_names_to_the_user(
     [
         (["down", "front"], ("observation.images.down", "observation.images.front")),
         (["camera_0", "camera_1"], ("left.rgb", "right.rgb")),
+        (["camera_0", "camera_1"], ("höhe", "\N{HELICOPTER}")),
     ],
 )
 def test_cameras_are_called_by_the_ends_of_their_keys_or_numbered(
