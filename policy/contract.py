@@ -97,7 +97,7 @@ ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
 LEAST = 1e-3
 """Least time in seconds, and least value of any other quantity that is a divisor."""
 LEAST_RATE_HZ = 0.01
-MOST_PIXEL = 1e3
+MOST_PIXEL = 10.0
 """Largest mean and standard deviation of an image; its pixels are in [0, 1]."""
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
@@ -280,7 +280,8 @@ class Contract:
         ):
             rgb = getattr(self, name)
             is_right = len(rgb) == 3 and all(_is_within(value, low, MOST_PIXEL) for value in rgb)
-            yield name, is_right, f"three numbers in [{low:g}, {MOST_PIXEL:g}]"
+            wanted = f"three numbers in [{low:g}, {MOST_PIXEL:g}], for pixels in [0, 1]"
+            yield name, is_right, wanted
             wanted = "left out: image_channels 'depth' gives metres as they are"
             yield name, not self.is_depth or rgb == usual, wanted
         crop, names, extras = self.image_crop, self.cameras, self.state_extras
