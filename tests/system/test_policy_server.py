@@ -233,6 +233,10 @@ def test_a_server_may_say_fields_that_the_file_lacks(
         policy, _ = load_server_policy(url, contract_file)
         with closing(policy):
             assert (policy.contract.horizon, predict(policy)) == (4, 0.5)
+        both = 'cameras = ["front", "down"]\n[images]\nfront = "image"\ndown = "image"\n'
+        contract_file.write_text(CONTRACT + both)
+        with pytest.raises(PolicyError, match="one key to several cameras: image, image"):
+            load_server_policy(url, contract_file)
 
 
 def test_addresses_without_a_policy_server(

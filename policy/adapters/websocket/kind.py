@@ -64,6 +64,8 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
     try:
         metadata = link.connect()
         interface = _interface(contract_file, metadata)
+        if len(set(keys := interface.camera_keys)) < len(keys):
+            raise ContractError(f"[images] gives one key to several cameras: {', '.join(keys)}")
         policy = RemotePolicy(link, interface, is_ours=CONTRACT_KEY in metadata)
         return policy, [policy.try_out()]
     except PolicyError as error:
