@@ -1,6 +1,5 @@
 """Observers of one flight: timing, terminal, Rerun viewer and recorder."""
 
-import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -35,6 +34,7 @@ from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
+from mavbridge.recording.folder import remove_flight
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
@@ -121,7 +121,7 @@ class FlightObservers:
         )
         self._viewer = ObserverThread(
             "mavbridge-rerun",
-            RerunView(config.rerun, flight),
+            RerunView(config.rerun, flight, is_live=True),
             capacity=RERUN_CAPACITY,
             cameras=len(contract.cameras),
         )
@@ -201,22 +201,14 @@ class FlightObservers:
     def finish(
         self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None
     ) -> None:
-        """Show the report and write it to --report; without a vehicle, delete the flight's
-        files."""
+        """Show the report and write it to --report; without a vehicle, delete the recording."""
         try:
             if autopilot is not None:
                 self._report(summary, autopilot, outcome)
-            else:
-                self._discard()
+            elif self._recorder is not None and self._config.record is not None:
+                remove_flight(self._config.record, self._plan.contract.cameras)
         finally:  # an exception is printed only then
             self.screen.close(SCREEN_CLOSE_S)
-
-    def _discard(self) -> None:
-        """Delete the closed files of a flight that found no vehicle."""
-        if self._recorder is not None and self._config.record is not None:
-            shutil.rmtree(self._config.record, ignore_errors=True)
-        if self._viewer is not None and self._config.rerun.endswith(".rrd"):
-            Path(self._config.rerun).unlink(missing_ok=True)
 
     def _report(
         self, summary: GuardSummary | None, autopilot: str, outcome: FlightOutcome | None

@@ -1,5 +1,7 @@
 """Names in a flight's folder, and the check that it can be written. Imports no extra."""
 
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
@@ -64,3 +66,13 @@ def prepare_folder(folder: Path, flag: str) -> None:
             f"{flag} {folder} is not empty (it holds {taken[0]}); every flight has a folder of "
             "its own: name a new one"
         )
+
+
+def remove_flight(folder: Path, cameras: Sequence[str]) -> None:
+    """Delete the files of a recorded flight; other files, and the folder, stay."""
+    names = (None, *cameras[1:])
+    stems = (TICKS, SOLVES, PACKETS, *map(frames_of, names), *map(features_of, names))
+    tables = (f"{stem}.{ending}" for stem in stems for ending in ("arrows", "parquet"))
+    for name in (META, SETTINGS, TLOG, *map(video_of, names), *tables):
+        with suppress(OSError):
+            (folder / name).unlink(missing_ok=True)

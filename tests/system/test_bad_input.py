@@ -171,6 +171,12 @@ def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture
     assert status == 3
     assert "heard nothing" in text
     assert list(tmp_path.iterdir()) == []
+    folder, viewed = tmp_path / "flight", tmp_path / "flight.rrd"
+    folder.mkdir()
+    viewed.write_text("an older flight")
+    kept = ("--record", str(folder), "--rerun", str(viewed))
+    assert run(capsys, "--connect", connect, *flags, *kept)[0] == 3
+    assert (list(folder.iterdir()), viewed.read_text()) == ([], "an older flight")
 
 
 def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,16 +35,18 @@ class RerunView:
     images with their exposure. An unmeasured value is a gap in its line.
     """
 
-    def __init__(self, target: str, flight: ViewedFlight) -> None:
+    def __init__(self, target: str, flight: ViewedFlight, *, is_live: bool = False) -> None:
         """Check the target; calls that can block are left to ``consume`` and ``close``.
 
         Args:
             target: that of ``prepare_target``.
             flight: facts known before the flight.
+            is_live: a file is opened, and an older one replaced, only once the vehicle is heard.
         """
         self._flight = flight
         self._recording = RerunRecording("mavbridge", target)
         self._is_open = False
+        self._awaits_vehicle = is_live and target.endswith(".rrd")
         self._has_start = False
         self._until_ns = 0
         """Newest stamp of a plotted event."""
@@ -59,8 +61,11 @@ class RerunView:
 
     def consume(self, batch: Sequence[Observed]) -> None:
         """Send one batch; blocks while the viewer does not keep up."""
-        self._open()
         ticks = [event for event in batch if isinstance(event, Tick)]
+        if self._awaits_vehicle and all(tick.mode is None for tick in ticks):
+            return
+        self._awaits_vehicle = False
+        self._open()
         solves = [event for event in batch if isinstance(event, Solve)]
         visions = [event for event in batch if isinstance(event, VisionTick)]
         if batch and not self._has_start:
@@ -87,6 +92,8 @@ class RerunView:
 
     def close(self) -> None:
         """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
+        if self._awaits_vehicle:
+            return
         self._open()
         self._timing.close()
         if self._has_start:

@@ -10,6 +10,7 @@ from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.folder import remove_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 
@@ -88,3 +89,12 @@ def test_a_full_disk_ends_the_recording_with_one_warning(
     assert 0 < back.frames.num_rows < number
     numbers = [row.frame_id - 1 for row in back.frame_rows()]
     assert [number_of(rgb) for rgb in back.images()] == numbers
+
+
+def test_a_removed_flight_leaves_the_files_of_others(tmp_path: Path) -> None:
+    with RecorderStand(tmp_path) as stood:
+        (tmp_path / "notes.txt").touch()
+        stood.emit(range(10), range(10))
+    assert stood.recorder.meta.finished
+    remove_flight(tmp_path, ("front",))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

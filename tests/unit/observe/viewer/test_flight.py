@@ -206,6 +206,20 @@ def test_every_stick_has_its_series_and_events_are_transitions_across_batches(sh
     assert " ".join(line[10:] for line in lines[5:-2]) == text
 
 
+def test_an_older_file_is_replaced_only_once_the_vehicle_is_heard(tmp_path: Path) -> None:
+    path = tmp_path / "flight.rrd"
+    path.write_text("an older flight")
+    for unheard in (make_released_tick(0, mode=None), make_vision_tick(1)):
+        view = RerunView(str(path), viewed(), is_live=True)
+        view.consume([unheard])
+        view.close()
+        assert path.read_text() == "an older flight"
+    view = RerunView(str(path), viewed(), is_live=True)
+    view.consume([make_tick(0)])
+    view.close()
+    assert Recording(path).rows("age/attitude")
+
+
 def turned(*, yaw_rad: float, roll_rad: float) -> tuple[float, ...]:
     (yaw_c, yaw_s), (c, s) = ((math.cos(a / 2), math.sin(a / 2)) for a in (yaw_rad, roll_rad))
     return (yaw_c * c, yaw_c * s, yaw_s * s, yaw_s * c)
