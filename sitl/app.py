@@ -224,8 +224,12 @@ def _fly(args: argparse.Namespace) -> None:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
     if args.pilot and (args.rc_in or args.receiver):
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
-    if args.report is not None and not args.report.parent.is_dir():
-        raise UsageError(f"--report {args.report}: there is no folder {args.report.parent}")
+    if args.report is not None:
+        with _writing(args.report):
+            is_new = not args.report.exists()
+            args.report.open("a").close()
+            if is_new:
+                args.report.unlink()
     config, course = _config(args, len(links), len(onboard)), make_course(args.course, args.laps)
     clock = Clock()
     with ExitStack() as stack:
@@ -254,8 +258,18 @@ def _fly(args: argparse.Namespace) -> None:
             os.nice(LEAST_PRIORITY)
             fly_on(vehicle, args.fly_on)
         if args.report is not None:
-            write_report(args.report, vehicle.log.summary(vehicle.ap))
+            with _writing(args.report):
+                write_report(args.report, vehicle.log.summary(vehicle.ap))
             print_status(f"report written to {args.report}")
+
+
+@contextmanager
+def _writing(report: Path) -> Iterator[None]:
+    """Context manager: raise UsageError if the report cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"--report {report}: {error.strerror}; name another file") from error
 
 
 def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig:

@@ -118,6 +118,8 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
             ["--connect", "foo:1"],
             ["--connect", url],
             ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path / "no" / "fc.json")],
+            ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path), "--duration", "0.01"],
+            ["--connect", "udpout:127.0.0.1:9", "--report", "/proc/fc.json", "--duration", "0.01"],
             ["camera", "--follow", "udp:127.0.0.1:9"],
             ["--connect", "udpout:127.0.0.1:9", "--rc-in", url.rpartition(":")[2]],
         ]
@@ -126,3 +128,10 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
             error = capsys.readouterr().err
             assert error.startswith("sitl: error: ")
             assert error.count("\n") == 1
+
+
+def test_a_disk_that_is_full_at_the_end_is_an_error_in_one_line(capsys):
+    url = "udpout:127.0.0.1:9"
+    assert main(["--connect", url, "--report", "/dev/full", "--duration", "0.01"]) == 2
+    *_, last = capsys.readouterr().err.splitlines()
+    assert last.startswith("sitl: error: --report /dev/full: No space left on device")
