@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 import cv2
 from rich.console import Console
@@ -28,7 +27,7 @@ from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.vehicle import FlightEnd
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
-from mavbridge.flight.checks import check_flight, signing_note
+from mavbridge.flight.checks import check_flight, output_folders, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess, start_guard
 from mavbridge.flight.observers import FlightObservers
@@ -65,11 +64,9 @@ def fly(config: FlyConfig) -> int:
     """
     clock = MonotonicClock()
     console = flight_console()
-    report_folder = config.report.parent if config.report else None
-    viewer_folder = Path(config.rerun).parent if config.rerun.endswith(".rrd") else None
     # The policy is closed last, after the guard has ended: its close may hang or raise.
     with (
-        empty_folders_removed(config.record, report_folder, viewer_folder),
+        empty_folders_removed(*output_folders(config)),
         ExitStack() as policy_life,
         ExitStack() as stack,
     ):

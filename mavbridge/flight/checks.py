@@ -1,5 +1,9 @@
 """Checks that run before anything slow is loaded."""
 
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
 from mavbridge.camera.open import check_camera
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.address import is_reachable, parse_address
@@ -32,10 +36,27 @@ def check_flight(config: FlyConfig) -> None:
         check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)
     require_images(config)
-    require_writable(config.report, "--report")
-    if config.gates is not None:
-        read_gates(config.gates)
-    if config.record is not None:
-        prepare_folder(config.record, "--record")
-    check_target(config.rerun)
+    for _name, _value, check in file_checks(config):
+        check()
     require_cameras(config)
+
+
+def file_checks(config: FlyConfig) -> Iterator[tuple[str, object, Callable[[], object]]]:
+    """Yield name, value and check of each file that a flight uses, and of its viewer.
+
+    A check creates folders, as the flight does, and raises MavbridgeError.
+    """
+    if config.report is not None:
+        yield "report", config.report, partial(require_writable, config.report, "--report")
+    if config.gates is not None:
+        yield "gates", config.gates, partial(read_gates, config.gates)
+    if config.record is not None:
+        yield "recording", config.record, partial(prepare_folder, config.record, "--record")
+    if config.rerun != "off":
+        yield "viewer", config.rerun, partial(check_target, config.rerun)
+
+
+def output_folders(config: FlyConfig) -> tuple[Path | None, ...]:
+    """Return the folders that a flight may create."""
+    viewer_folder = Path(config.rerun).parent if config.rerun.endswith(".rrd") else None
+    return config.record, config.report and config.report.parent, viewer_folder

@@ -14,9 +14,10 @@ from mavbridge.core.provenance import without_secrets
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
 _STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
-_FOOT = (
-    "Nothing was set, armed or flown. What a flight asks for was asked for as well: message "
-    "rates, which stay until the vehicle or another station changes them."
+_FOOT = "Nothing was set, armed or flown."
+_REQUESTED = (
+    " Message rates were requested as for a flight; they stay until the vehicle reboots or another "
+    "station changes them."
 )
 
 
@@ -77,7 +78,8 @@ def print_check(rows: Sequence[CheckRow], console: Console) -> None:
     for verdict in ("no-go", "warn"):
         _print_reasons([row for row in rows if row.verdict == verdict], console)
     console.print()
-    console.print(Text(_FOOT, style="dim"))
+    has_vehicle = any(row.area == "vehicle" for row in rows)
+    console.print(Text(_FOOT + _REQUESTED * has_vehicle, style="dim"))
     console.print(_summary(rows))
 
 

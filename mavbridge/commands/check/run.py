@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
-from mavbridge.core.files import require_writable, write_output
+from mavbridge.core.files import empty_folders_removed, require_writable, write_output
+from mavbridge.flight.checks import file_checks, output_folders
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import looks_at_images, require_images
 from policy.contract import Contract
@@ -48,7 +50,7 @@ def check(config: CheckConfig) -> int:
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
         rows = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
-    rows += [*cameras, *policy, *computer_rows(flight.rates)]
+    rows += [*cameras, *policy, *computer_rows(flight.rates), *_file_rows(flight)]
     soaked: dict[str, object] | None = None
     if config.soak is not None:
         print_status(f"flying the bundled vehicle for {config.soak:g} s")
@@ -65,6 +67,17 @@ def check(config: CheckConfig) -> int:
     if is_on_stdout:
         sys.stdout.write(document)
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
+
+
+def _file_rows(config: FlyConfig) -> Iterator[CheckRow]:
+    """Yield a row on each file that the flight uses, and on its viewer."""
+    with empty_folders_removed(*output_folders(config)):
+        for name, value, check_file in file_checks(config):
+            try:
+                check_file()
+                yield CheckRow("computer", name, str(value))
+            except MavbridgeError as error:
+                yield CheckRow("computer", name, str(value), no_go=str(error))
 
 
 def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:

@@ -62,8 +62,25 @@ def test_a_policy_and_a_computer_are_checked_without_a_vehicle(
 ) -> None:
     config = replace(flight("scripted:hover"), link=LinkConfig(connect="none"))
     assert check(CheckConfig(timing=0.5, flight=config, json=Path("-"))) == ExitCode.DONE
+    out, err = capsys.readouterr()
+    assert {row["area"] for row in json.loads(out)["rows"]} == {"link", "policy", "computer"}
+    assert "Nothing was set, armed or flown.\n" in err, "no message rates were requested"
+
+
+def test_files_that_a_flight_refuses_are_a_no_go_and_folders_are_removed_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new, missing = tmp_path / "new", tmp_path / "missing.json"
+    config = replace(flight("none"), link=LinkConfig(connect="none"))
+    good = replace(config, record=new, report=tmp_path / "a" / "r.json", rerun=f"{new}.rrd")
+    assert check(CheckConfig(flight=good)) == ExitCode.DONE
+    capsys.readouterr()
+    bad = replace(config, gates=missing, record=Path("/proc"), rerun="foo", report=Path("/proc/x"))
+    assert check(CheckConfig(flight=bad, json=Path("-"))) == ExitCode.NOT_FLOWN
     rows = json.loads(capsys.readouterr().out)["rows"]
-    assert {row["area"] for row in rows} == {"link", "policy", "computer"}
+    no_gos = {row["name"] for row in rows if row["verdict"] == "no-go"}
+    assert no_gos == {"report", "gates", "recording", "viewer"}
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -89,9 +106,9 @@ def test_a_pace_that_is_not_held_is_a_warning(
 @pytest.mark.parametrize("width", [80, 160])
 def test_the_table_fits_its_terminal_and_ends_with_what_to_do(width: int) -> None:
     out = io.StringIO()
-    print_check(
-        [GO, REFUSED], Console(file=out, width=width, force_terminal=True, color_system=None)
-    )
+    rows = [GO, replace(GO, area="vehicle"), REFUSED]
+    print_check(rows, Console(file=out, width=width, force_terminal=True, color_system=None))
+    assert "Message rates were requested" in out.getvalue()
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert "NO-GO" in lines[-2]
