@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from faults.props import FrameFeed
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.core.processes import free_port
 from sitl.clock import Clock
 
@@ -17,13 +17,10 @@ pytestmark = pytest.mark.system
 
 def run(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
     """Exit status and all output, on one line."""
-    with pytest.raises(SystemExit) as exit_info:
-        main(flags)
-    captured = capsys.readouterr()
+    status, captured = status_of(*flags), capsys.readouterr()
     text = " ".join((captured.out + captured.err).replace("│", " ").split())
     assert "Traceback" not in text
-    assert isinstance(exit_info.value.code, int)
-    return exit_info.value.code, text
+    return status, text
 
 
 def test_help_of_fly_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
