@@ -40,16 +40,17 @@ class Limits(Ranged):
     """Oldest attitude and body rates to act on, in seconds, when a command leaves; default: the
     policy's contract, which this can only tighten."""
     max_velocity_age: Age = None
-    """Oldest velocity and acceleration to act on, in seconds; default and direction as
-    attitude_age."""
+    """Oldest velocity and acceleration to act on, in seconds; default: the policy's contract,
+    which this can only tighten."""
     max_feature_age: Age = None
-    """Oldest image to act on, in seconds since exposure; default and direction as attitude_age."""
+    """Oldest image to act on, in seconds since exposure; default: the policy's
+    contract, which this can only tighten."""
     max_chunk_age: Age = None
-    """Oldest chunk of actions to act on, in seconds since it was computed; default and direction as
-    attitude_age."""
+    """Oldest chunk of actions to act on, in seconds since it was computed; default: the
+    policy's contract, which this can only tighten."""
     max_stall: Age = None
-    """Longest time in seconds to fly on along one chunk when no newer one comes; default and
-    direction as attitude_age."""
+    """Longest time in seconds to fly on along one chunk when no newer one comes; default:
+    the policy's contract, which this can only tighten."""
     max_frozen_state: Annotated[float, Between(0, 60, "s")] = 0.5
     """Longest time in seconds for which the attitude may stay bit-identical while the vehicle
     turns; 0 = no limit."""
