@@ -23,9 +23,9 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.files import require_writable, write_output
+from mavbridge.core.files import empty_folders_removed, require_writable, write_output
 from mavbridge.flight.app import fly_policy
-from mavbridge.flight.checks import check_flight
+from mavbridge.flight.checks import check_flight, output_folders
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
@@ -230,11 +230,12 @@ def identify(config: IdentifyConfig) -> int:
     trained = configured_contract(config.flight.policy)
     flight = doublet_flight(config, trained)
     require_writable(config.json, "--json")
-    check_flight(flight)
-    policy, runner = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
     recording = ResponseRecording()
-    plan = plan_flight(flight, runner.contract, is_dual=runner.dual_rate)
-    fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(recording,))
+    with empty_folders_removed(*output_folders(flight)):
+        check_flight(flight)
+        policy, runner = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
+        plan = plan_flight(flight, runner.contract, is_dual=runner.dual_rate)
+        fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(recording,))
     if policy.program_start_s is None:
         raise PeerError("the flight ended before the doublet began: there is nothing to measure")
     found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)

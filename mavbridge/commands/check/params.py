@@ -6,7 +6,6 @@ from functools import cached_property, partial
 
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig
-from mavbridge.core.address import serial_baud
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import ActionKind
@@ -100,11 +99,7 @@ class Terms:
 
     def _dangers(self, *, is_accepted: bool) -> list[ParamNote]:
         """Return notes about the risks that the user has accepted, or has not."""
-        serial = serial_dangers(
-            serial_baud(self.settings.connect),
-            streams=self.streams,
-            stick_hz=self.settings.stick_hz,
-        )
+        serial = serial_dangers(self.settings, self.streams)
         return [
             danger.note(is_accepted=is_accepted)
             for danger in (*serial, *self.assessment.dangers)

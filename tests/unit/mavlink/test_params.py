@@ -1,5 +1,6 @@
 """Parameters: read, judged before a flight, watched in flight."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.parameters import ParamVehicle
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.link_settings import LinkSettings, SigningFiles
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import AdviceText, Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamWrite
@@ -16,6 +18,7 @@ from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.checks import serial_dangers
 
 S = NS_PER_S
+SIGNED = SigningFiles(key_file=Path("key"), state_folder=Path("state"))
 
 
 def after_reading(vehicle: ParamVehicle) -> ParamVehicle:
@@ -98,22 +101,23 @@ def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:
 
 
 @pytest.mark.parametrize(
-    ("baud", "rate_hz", "enough"),
+    ("place", "rate_hz", "signing", "enough"),
     [
-        (None, 400, None),
-        (57600, 100, 230400),
-        (115200, 100, 230400),
-        (230400, 100, None),
-        (115200, 50, 230400),
-        (115200, 30, None),
-        (230400, 200, 460800),
+        ("udp:127.0.0.1:14550", 400, None, None),
+        ("/dev/ttyX,57600", 100, None, 230400),
+        ("/dev/ttyX,115200", 100, None, 230400),
+        ("/dev/ttyX,230400", 100, None, None),
+        ("/dev/ttyX,230400", 100, SIGNED, 460800),
+        ("/dev/ttyX,115200", 50, None, 230400),
+        ("/dev/ttyX,115200", 30, None, None),
+        ("/dev/ttyX,230400", 200, None, 460800),
     ],
 )
 def test_a_serial_port_must_carry_what_is_asked_for(
-    baud: int | None, rate_hz: float, enough: int | None
+    place: str, rate_hz: float, signing: SigningFiles | None, enough: int | None
 ) -> None:
-    streams = ARDUPILOT.streams(state_hz=rate_hz)
-    found = serial_dangers(baud, streams=streams, stick_hz=rate_hz)
+    settings = LinkSettings(connect=place, stick_hz=rate_hz, signing=signing)
+    found = serial_dangers(settings, ARDUPILOT.streams(state_hz=rate_hz))
     expected = [] if enough is None else [enough]
     assert [dict(each.why.data)["enough"] for each in found] == expected
 

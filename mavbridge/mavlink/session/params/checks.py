@@ -5,9 +5,12 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.address import serial_baud
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Risk
 from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.frames import SIGNATURE_BYTES
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.profile import (
     Danger,
@@ -77,25 +80,26 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
     )
 
 
-def received_bytes_per_s(streams: Iterable[StreamGroup]) -> float:
+def received_bytes_per_s(streams: Iterable[StreamGroup], frame_bytes: int = _FRAME_BYTES) -> float:
     """Return the bandwidth of these streams with full-length messages, rare ones excluded."""
     steady = [(stream.rate_hz, stream.messages[0]) for stream in streams if stream.least_hz is None]
     streamed: float = sum(
-        rate_hz * (_FRAME_BYTES + dialect.mavlink_map[IDS[name]].unpacker.size)
+        rate_hz * (frame_bytes + dialect.mavlink_map[IDS[name]].unpacker.size)
         for rate_hz, name in steady
     )
     return _OTHERS_BYTES_PER_S + streamed
 
 
-def serial_dangers(
-    baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: float
-) -> tuple[Danger, ...]:
-    """Return the danger of a baud rate that is too low; ``baud`` None: not a serial port.
+def serial_dangers(settings: LinkSettings, streams: Iterable[StreamGroup]) -> tuple[Danger, ...]:
+    """Return the danger of a serial port's baud rate that is too low.
 
     A serial port carries both directions at once, so the fuller one decides.
     """
-    sent_bytes_per_s = _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
-    needed = max(received_bytes_per_s(streams), sent_bytes_per_s) * _BITS_PER_BYTE
+    baud = serial_baud(settings.connect)
+    signature_bytes = 0 if settings.signing is None else SIGNATURE_BYTES
+    sent_bytes_per_s = _OTHERS_BYTES_PER_S + settings.stick_hz * (_OVERRIDE_BYTES + signature_bytes)
+    received = received_bytes_per_s(streams, _FRAME_BYTES + signature_bytes)
+    needed = max(received, sent_bytes_per_s) * _BITS_PER_BYTE
     if baud is None or baud >= needed:
         return ()
     enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), needed)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 
-from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
@@ -101,9 +100,7 @@ class VehicleParams:
         self._config = config
         self._report = report
         self._output: Output | None = None
-        self._serial = serial_dangers(
-            serial_baud(config.connect), streams=streams, stick_hz=config.stick_hz
-        )
+        self._serial = serial_dangers(config, streams)
         self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
