@@ -122,7 +122,7 @@ class Settings(Dict):
                     "file, and --print-config shows the sections"
                 )
         update_argument_collection(
-            self.data,
+            {key: value for key, value in self.data.items() if value != {}},
             self.source,
             arguments,
             app.app_stack.stack[-1],

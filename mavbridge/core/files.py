@@ -1,5 +1,6 @@
 """File helpers: early checks of output paths, and durable writes."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -44,17 +45,26 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
                 folder.rmdir()
 
 
+_NOT_REPLACED = (errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS)
+"""Errors on replacing a file that may be writable all the same."""
+
+
 def write_output(path: Path, text: str, flag: str) -> None:
     """Write the file that a flag names, durably where it can be replaced.
 
-    A link such as /dev/stdout, a device or pipe, and a file in a read-only folder are written in
-    place. Raises UserError if that fails.
+    A link such as /dev/stdout, a device or pipe, a mounted file, and a file in a read-only folder
+    are written in place. Raises UserError if that fails.
     """
     is_plain = not path.is_symlink() and (path.is_file() or not path.exists())
     try:
-        if is_plain and os.access(path.parent, os.W_OK):
-            write_durably(path, text)
-        else:
+        try:
+            if is_plain:
+                write_durably(path, text)
+        except OSError as error:
+            if error.errno not in _NOT_REPLACED:
+                raise
+            is_plain = False
+        if not is_plain:
             path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UserError(

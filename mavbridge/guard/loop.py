@@ -322,6 +322,8 @@ class GuardLoop:
             try:
                 message = decode_to_guard(data)
             except ValueError:
+                if self._phase not in _TAKEN:
+                    raise  # nobody is held, and the bug is told with its traceback
                 self.stop(EndRequest(reason=because(Code.UNREADABLE), is_fault=True))
                 continue
             match message:

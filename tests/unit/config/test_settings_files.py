@@ -27,6 +27,12 @@ def test_the_printed_file_holds_the_defaults_of_every_setting(
         assert f"\n{line}" in printed
 
 
+def test_a_section_whose_keys_are_all_commented_out_asks_for_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text("[limits]\n# slew = 3\n[network]\n")
+    assert asked_flight(*VEHICLE, "--config", path) == asked_flight(*VEHICLE)
+
+
 def test_a_setting_on_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text("[limits]\nattitude-age = 0.09\nslew = 3\n[scheduling]\nrealtime = true\n")

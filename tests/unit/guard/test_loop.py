@@ -274,6 +274,10 @@ def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> No
     rig.run(0.05)
     assert rig.ticks[-1].phase is Phase.LEAVING
     assert rig.ticks[-1].reason == because(Code.UNREADABLE)
+    waiting = Rig()
+    waiting.port.inbox.append(b"Snonsense")
+    with pytest.raises(ValueError, match="not a message"):
+        waiting.run(0.05)
 
 
 @pytest.mark.parametrize("has_policy", [True, False], ids=["flight", "weights still loading"])

@@ -153,7 +153,7 @@ class TemporaryParams:
         Return True if everything is restored, or nothing more can be done now.
         """
         self._is_ending = True
-        return not self._wanted or (self._is_restoring and self.is_settled)
+        return not self._before or (self._is_restoring and self.is_settled)
 
     def _begin_restoring(self, values: Mapping[str, float]) -> dict[str, _Write]:
         self._is_restoring, writes = True, {}

@@ -14,6 +14,7 @@ from mavbridge.commands.evaluate import EpisodeSpec, FlownEpisode, evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.files import write_output
 from mavbridge.core.reasons import Code, because
 
 
@@ -87,6 +88,20 @@ def test_a_full_disk_ends_the_evaluation_and_keeps_its_results(
     assert flights.flown == [0, 1, 2]
     assert config.json.read_text() == text
     assert [*config.json.parent.iterdir()] == [config.json]
+
+
+@pytest.mark.parametrize("number", [errno.EBUSY, errno.EROFS])
+def test_a_file_that_cannot_be_replaced_is_written_in_place(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as one that is mounted into a container."""
+
+    def fail(_temporary: Path, _target: Path) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "replace", fail)
+    write_output(tmp_path / "out.json", "text", "--json")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": "text"}
 
 
 def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
