@@ -230,7 +230,10 @@ def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
         yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
     path_m = flight.track.length_m if flight.track else 0.0
     yield Figure("path", "m", path_m, more_is_better=None)
-    yield Figure("gates passed", "", flight.meta.gates_passed, 0, more_is_better=True)
+    gates_passed, outcome = flight.meta.gates_passed, flight.meta.outcome
+    if gates_passed is None and outcome is not None:
+        gates_passed = outcome.gates_passed
+    yield Figure("gates passed", "", gates_passed, 0, more_is_better=True)
 
 
 MAX_FLIGHTS = 2

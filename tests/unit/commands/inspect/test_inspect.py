@@ -22,6 +22,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState, VisionTick
 from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.meta import read_meta
 from policy.contract import Contract
 
 GOLDEN = Path(__file__).parents[3] / "data/flights"
@@ -113,7 +114,10 @@ def test_series_hold_what_was_sent_and_axes_of_ros_become_ned_axes(tmp_path: Pat
 
 def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Path) -> None:
     steady = [make_tick(index, predict_ns=4 * NS_PER_MS) for index in range(100)]
-    second = analyse(write(tmp_path / "second", steady, meta=make_meta(policy="toge")))
+    outcome = read_meta(GOLDEN / "toge_ardupilot").outcome
+    assert outcome is not None
+    meta = make_meta(policy="toge").with_outcome(replace(outcome, gates_passed=5))
+    second = analyse(write(tmp_path / "second", steady, meta=meta))
     lines = shown(analyse(stalled), second).splitlines()
     assert all(len(line) <= 80 for line in lines)
     cells = [[cell.strip() for cell in line.split("│")] for line in lines if "│" in line]
@@ -121,6 +125,7 @@ def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Pat
     assert rows["policy"][:3] == ["scripted:hover", "toge", "differs"]
     assert rows["late chunks"][:3] == ["1", "0", "-100% better"]
     assert rows["predict, p50 [ms]"][2] == "+100% worse"
+    assert rows["gates passed"][:2] == ["-", "5"]
 
 
 def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
