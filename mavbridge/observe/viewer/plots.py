@@ -115,7 +115,8 @@ class TimingPlots:
         self._spreads = {
             plot: Spread(columns, plot, bound_ns) for plot, bound_ns in bounds_ns.items()
         }
-        self._last_chunk: Tick | None = None
+        self._last_chunk: tuple[int, int] | None = None
+        """Serial and end of the computation."""
         self._last_started_ns: int | None = None
         self._last_channels: tuple[int, ...] | None = None
         self._missed_slots = self._images = 0
@@ -157,12 +158,15 @@ class TimingPlots:
         for tick in ticks:
             if tick.chunk_serial is None or tick.chunk_computed_ns is None:
                 last = None  # time without a chunk is not a period
-            elif last is None or tick.chunk_serial != last.chunk_serial:
-                if last is not None and last.chunk_computed_ns is not None:
-                    period_ns = tick.chunk_computed_ns - last.chunk_computed_ns
-                    self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
+                continue
+            newest = (tick.chunk_serial, tick.chunk_computed_ns)
+            if last is not None and (count := newest[0] - last[0]) > 0:
+                # Also counts chunks that a newer one overtook before any send, as the report does.
+                period_ns = (newest[1] - last[1]) // count
+                self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
+            if last is None or newest[0] != last[0]:
                 news.append(tick)
-                last = tick
+            last = newest
         self._last_chunk = last
         predict_ns = [(new.sent_ns, new.predict_ns) for new in news if new.predict_ns is not None]
         self._spreads[layout.PREDICT].extend(predict_ns)

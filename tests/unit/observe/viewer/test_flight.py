@@ -135,10 +135,10 @@ def test_chunks_and_missed_slots_go_on_across_batches_not_across_releases(show: 
     repeated = make_tick(2, chunk_serial=1, chunk_computed_ns=make_tick(1).chunk_computed_ns)
     seen = show(
         [make_tick(0), make_tick(1), repeated],
-        [make_tick(4, missed_slots=3)],
+        [make_tick(4, missed_slots=3, chunk_serial=3)],  # chunk 2 was overtaken
         [make_released_tick(20), make_tick(21)],
     )
-    assert seen.rows("period/chunk") == [[10, 30, 20, 10]]
+    assert seen.rows("period/chunk") == [[10, 15, 12.5, 10]]
     assert seen.rows("compute/chunk") == [[2, 2, 2, 10]]
     assert seen.values("missed/sticks", 1) == [0, 3, 3]
     assert seen.values("missed/sticks", 0) == pytest.approx([0.002, 0.004, 0.021])  # allowed
