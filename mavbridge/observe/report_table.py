@@ -11,8 +11,8 @@ _NOT_MEASURED = "-"
 _STYLE_GOOD, _STYLE_POOR, _STYLE_BAD = "green", "yellow", "red"
 _LEGEND = (
     "stick lateness: from a slot of the stick grid to its send; a slot is missed when nothing was "
-    "sent within one period. New attitude to wire: from the arrival of a new attitude until the "
-    "first sticks based on it are sent."
+    "sent within one period. New attitude to wire: from the measurement of a new attitude to "
+    "the first send of sticks based on it."
 )
 
 

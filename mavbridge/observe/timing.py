@@ -102,7 +102,8 @@ class TimingReport:
     """Time from the measurement of an attitude (its arrival, if the vehicle sends no stamp) to the
     send of each action based on it."""
     state_to_wire_ms: Percentiles | None
-    """State to wire: time from the arrival of a new attitude to the first send based on it."""
+    """Time from the measurement of a new attitude, as in ``state_age_ms``, to the first send based
+    on it; it includes the delay of the link."""
     link: LinkStats | None
     releases: tuple[ReleaseEvent, ...]
     """The first ``MAX_RELEASES``."""
