@@ -330,17 +330,16 @@ def _at_ns(event: Observed) -> int:
 
 
 def _images(recorded: RecordedFlight, camera: int) -> Iterator[Observed]:
-    dropped = 0
+    """Yield the images; stand-ins fill the start of the encoding and the drops, not recorded."""
     pairs = zip(recorded.frame_rows(), recorded.images(), strict=True)
     for serial, (row, image) in enumerate(pairs):
-        dropped += row.dropped_before
         yield VisionTick(
             serial=serial,
             frame_id=row.frame_id,
             captured_ns=row.captured_ns,
             started_ns=row.captured_ns,
             ready_ns=row.ready_ns,
-            dropped_frames=dropped,
+            dropped_frames=0,
             rgb=image,
             camera=camera,
         )

@@ -42,6 +42,7 @@ class RerunView:
             target: that of ``prepare_target``.
             flight: facts known before the flight.
             is_live: a file is opened, and an older one replaced, only once the vehicle is heard.
+                False: a recording, whose images have no start of encoding and no count of drops.
         """
         self._flight = flight
         self._recording = RerunRecording("mavbridge", target)
@@ -52,7 +53,7 @@ class RerunView:
         """Newest stamp of a plotted event."""
         columns = Columns(self._recording.stream)
         self._columns = columns
-        self._timing = TimingPlots(columns, flight)
+        self._timing = TimingPlots(columns, flight, is_live=is_live)
         self._actions = ActionPlots(columns, flight)
         self._scene = SceneView(columns, flight)
         self._plan = PlanView(columns, flight)

@@ -98,8 +98,9 @@ _GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
 class TimingPlots:
     """Plots of the page ``Timing``; images are those of the first camera."""
 
-    def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
+    def __init__(self, columns: Columns, flight: ViewedFlight, *, is_live: bool) -> None:
         self._columns = columns
+        self._is_live = is_live
         slot_ns, chunk_ns = NS_PER_S / flight.stick_hz, NS_PER_S / flight.chunk_hz
         self._slot_ns, self._vision_ns = slot_ns, NS_PER_S / flight.vision_hz
         bounds_ns = {
@@ -183,9 +184,7 @@ class TimingPlots:
         self._columns.plot(layout.RC, stamps_ns, values_us)
 
     def show_visions(self, visions: Sequence[VisionTick]) -> None:
-        """Plot the images of one camera."""
-        encode_ns = [(each.ready_ns, each.ready_ns - each.started_ns) for each in visions]
-        self._spreads[layout.ENCODE].extend(encode_ns)
+        """Plot the images of one camera; of a recording, only their periods."""
         started_ns = [vision.started_ns for vision in visions]
         if self._last_started_ns is not None:
             started_ns.insert(0, self._last_started_ns)
@@ -194,6 +193,10 @@ class TimingPlots:
         self._spreads[layout.VISION_PERIOD].extend(periods_ns)
         jitter_ns = [(stamp, abs(period - self._vision_ns)) for stamp, period in periods_ns]
         self._spreads[layout.VISION_JITTER].extend(jitter_ns)
+        if not self._is_live:
+            return
+        encode_ns = [(each.ready_ns, each.ready_ns - each.started_ns) for each in visions]
+        self._spreads[layout.ENCODE].extend(encode_ns)
         if self._first_dropped is None:
             self._first_dropped = visions[0].dropped_frames
         dropped = visions[-1].dropped_frames - self._first_dropped

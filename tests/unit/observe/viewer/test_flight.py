@@ -92,9 +92,9 @@ def viewed(contract: Contract | None = None, gates: tuple[CourseGate, ...] = ())
 def show(tmp_path: Path) -> Callable[..., Recording]:
     """Shows batches of events of a flight."""
 
-    def run(*batches: list[Observed], **facts: Any) -> Recording:
+    def run(*batches: list[Observed], is_live: bool = True, **facts: Any) -> Recording:
         path = tmp_path / "flight.rrd"
-        view = RerunView(str(path), viewed(**facts))
+        view = RerunView(str(path), viewed(**facts), is_live=is_live)
         for batch in batches:
             view.consume(batch)
         view.close()
@@ -151,7 +151,11 @@ def test_images_hang_at_their_camera_with_their_exposure_and_the_first_is_timed(
     rgb[:, :, 0] = 200  # red
     first, second, late = (make_vision_tick(number, rgb=rgb) for number in (1, 2, 4))
     below, contract = make_vision_tick(2, camera=1), Contract(cameras=("front", "down"))
-    seen = show([make_tick(0), first, second, below], [late], contract=contract)
+    batches = [make_tick(0), first, second, below], [late]
+    recorded = show(*batches, contract=contract, is_live=False)  # no such figures, only gaps
+    assert recorded.rows("compute/vision") == recorded.rows("missed/vision") == []
+    seen = show(*batches, contract=contract)
+    assert seen.rows("period/vision") == recorded.rows("period/vision")
     assert seen.rows("period/vision")[0] == pytest.approx([33.333, 66.667, 50, 33.333], abs=0.01)
     assert seen.rows("jitter/vision")[0] == pytest.approx([0, 33.333, 16.667, 33.333], abs=0.01)
     assert seen.rows("compute/vision") == [pytest.approx([20, 20, 20, 33.333], abs=0.01)]
