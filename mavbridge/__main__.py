@@ -1,5 +1,6 @@
 """Entry point: expected errors are one message and their status; anything else is our bug."""
 
+import io
 import os
 import signal
 import sys
@@ -13,6 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; by default that of the process."""
     if arguments is None:  # our process: its children import nothing from the working directory
         os.environ.setdefault(SAFE_PATH, OUR_SAFE_PATH)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # escape what its encoding lacks, as stderr does
+        sys.stdout.reconfigure(errors="backslashreplace")
     if (problem := hidden_package()) is not None:
         sys.stderr.write(f"error: {problem}\n")
         sys.exit(2)  # ExitCode.REFUSED, which cannot be imported yet

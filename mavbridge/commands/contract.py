@@ -51,7 +51,7 @@ def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
         )
     dataset = dataset or dataset_of(source)
     if dataset is not None and (dataset / CONTRACT_FILE).is_file():
-        text = (dataset / CONTRACT_FILE).read_text()
+        text = (dataset / CONTRACT_FILE).read_text(encoding="utf-8")
         return text, f"a copy of {dataset / CONTRACT_FILE}, which mavbridge export wrote"
     text, summary = _described(source, checkpoint_entries(source, dataset))
     if dataset is None:

@@ -234,7 +234,7 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
         "Contract of the policies that are trained on this dataset, written by mavbridge export: "
         "mavbridge --policy lerobot:DIR --contract THIS_FILE"
     )
-    (dataset / CONTRACT_FILE).write_text(draft_text(title, entries))
+    (dataset / CONTRACT_FILE).write_text(draft_text(title, entries), encoding="utf-8")
 
 
 def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[ImageArray]:

@@ -31,11 +31,11 @@ _HERE = files("mavbridge.commands.inspect")
 def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
     """Write one page with the flights side by side, which needs no other file and no network."""
     title = "mavbridge: " + " and ".join(flight.folder.name for flight in flights)
-    text = _HERE.joinpath("page.html").read_text()
+    text = _HERE.joinpath("page.html").read_text(encoding="utf-8")
     for name, value in (
         ("title", html.escape(title)),
-        ("css", _HERE.joinpath("page.css").read_text()),
-        ("script", _HERE.joinpath("page.js").read_text()),
+        ("css", _HERE.joinpath("page.css").read_text(encoding="utf-8")),
+        ("script", _HERE.joinpath("page.js").read_text(encoding="utf-8")),
         ("data", page_data(flights)),
     ):
         text = text.replace("{{" + name + "}}", value)

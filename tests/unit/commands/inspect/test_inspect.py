@@ -1,6 +1,9 @@
 import io
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -90,6 +93,21 @@ def test_one_flight_is_told_with_its_figures_causes_and_moments(
     assert document["report"]["releases"] == [release]
     assert [span["reason"] for span in document["holders"][1:]] == [None, release["reason"]]
     assert "The worst moments" in capsys.readouterr().out
+
+
+def test_a_terminal_without_utf8_gets_escapes_and_the_page_is_whole(tmp_path: Path) -> None:
+    write(tmp_path / "flight", flown(9), meta=make_meta(policy="飛"))
+    c_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    ended = subprocess.run(
+        [sys.executable, "-m", "mavbridge", "inspect", "flight", "--html", "page.html"],
+        cwd=tmp_path,
+        env=os.environ | c_locale | {"PYTHONPATH": str(GOLDEN.parents[2])},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "\\u98db on torch" in ended.stdout
+    assert "≥" in (tmp_path / "page.html").read_text(encoding="utf-8")  # of its script
 
 
 def test_series_hold_what_was_sent_and_axes_of_ros_become_ned_axes(tmp_path: Path) -> None:
