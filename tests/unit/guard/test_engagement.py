@@ -295,6 +295,7 @@ def test_readiness_that_comes_and_goes_does_not_prolong_the_way_in() -> None:
     stepped.step("engage", is_policy_reset=False)
     for _ in range(4):
         stepped.run(0.5, problem=because(Code.HEARTBEAT_LOST))
+        assert stepped.engagement.starting_ns is None, "the next reset begins anew"
         stepped.run(0.5, problem=None)
     assert stepped.phase is not Phase.PREPARING
 
