@@ -72,6 +72,8 @@ class FlightData:
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
     terms: ActionTerms = STICK_TERMS
+    course_seed: int | None = None
+    """Seed of the simulated course; its flights are held out together. None: unknown."""
     damage: tuple[str, ...] = ()
     """Skipped parts of its files, in sentences for the user."""
 
@@ -143,8 +145,16 @@ def hold_out(
 ) -> tuple[list[int], list[int]]:
     """Return the indices of the flights for training and for validation.
 
-    With two flights or more and a fraction above 0, at least one is held out and one is kept.
+    The flights of one course seed stay together. With two courses or more and a fraction above 0,
+    at least one course is held out and one is kept; a flight without a seed is a course of its own.
     """
-    order = np.random.default_rng([seed, 1]).permutation(len(flights)).tolist()
-    count = min(max(1, round(fraction * len(flights))), len(flights) - 1) if fraction > 0 else 0
-    return sorted(order[count:]), sorted(order[:count])
+    courses = [
+        ("flight", index) if flight.course_seed is None else ("seed", flight.course_seed)
+        for index, flight in enumerate(flights)
+    ]
+    groups = list(dict.fromkeys(courses))
+    order = np.random.default_rng([seed, 1]).permutation(len(groups)).tolist()
+    count = min(max(1, round(fraction * len(groups))), len(groups) - 1) if fraction > 0 else 0
+    chosen = {groups[number] for number in order[:count]}
+    held = [index for index, course in enumerate(courses) if course in chosen]
+    return [index for index in range(len(flights)) if index not in held], held

@@ -116,6 +116,7 @@ def read_flight(folder: Path) -> FlightData:
     contract = _contract(meta)
     state_frame = parse_state_frame(name, contract.get("state_frame"))
     terms = _terms(name, contract)
+    course_seed = meta.get("course_seed")
     damage: list[str] = []
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     frames, numbers = _read_table(folder, "frames", _FRAME_COLUMNS, damage)
@@ -151,6 +152,7 @@ def read_flight(folder: Path) -> FlightData:
         sent_ns=sent_ns,
         sent=np.nan_to_num(sent, nan=0.0),
         terms=terms,
+        course_seed=course_seed if isinstance(course_seed, int) else None,
         age_ns=_ages(ticks),
         captured_ns=stamps(name, frames, "captured_ns"),
         gate=_gates(name, frames),

@@ -66,7 +66,7 @@ class RunSettings:
     precision: Precision = "auto"
     """Number format of the computation; auto takes bf16 where the hardware multiplies it."""
     validation_fraction: float = 0.1
-    """Share of the flights that are held out."""
+    """Share of the flights that are held out; those of one course stay together."""
     validations: int | None = None
     """Validations in the run, evenly spaced; one every two minutes or fifty steps, 4 to 20, if not
     given."""

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -180,6 +181,17 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
     assert hold_out([episode] * 10, 0.2, seed=3) == (kept, held)
     for count, fraction, held_out in ((2, 0.01, 1), (1, 0.5, 0), (3, 0.0, 0)):
         assert len(hold_out([episode] * count, fraction, seed=0)[1]) == held_out
+
+
+def test_flights_of_one_course_are_held_out_together(tmp_path: Path) -> None:
+    """An expert's and a student's flights of one seed share their course and conditions."""
+    seen = [read_flight(flight(tmp_path / str(n), {"course_seed": n})) for n in range(10)]
+    plain = [replace(each, course_seed=None) for each in seen]
+    kept, held = hold_out([*seen, *seen, *plain], 0.2, seed=3)
+    assert sorted(kept + held) == list(range(30))
+    assert [n for n in held if n < 10] == [n - 10 for n in held if 10 <= n < 20] != []
+    assert hold_out(seen, 0.2, seed=3) == hold_out(plain, 0.2, seed=3)
+    assert hold_out([seen[0]] * 2, 0.5, seed=0) == ([0, 1], [])
 
 
 @pytest.mark.parametrize(
