@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
@@ -18,13 +18,14 @@ from mavbridge.config.episodes import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.provenance import digests
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.core.vehicle import Action, BodyRates, Sticks
-from mavbridge.flight.policies import load_for_episodes
+from mavbridge.flight.policies import load_for_episodes, policy_files
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import META, prepare_folder
-from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
+from mavbridge.recording.meta import FlightMeta, read_meta
 from mavbridge.recording.rows import FrameTruth
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
@@ -229,6 +230,8 @@ class DemonstrationSpec:
     """Its contents are replaced."""
     seed: int
     config: DemonstrateConfig
+    weights: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the student's files, by absolute path."""
 
     def __str__(self) -> str:
         return f"demonstration {self.seed}"
@@ -303,9 +306,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         raise
     log = flight.vehicle.log
     success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
-    writer.finish(
-        replace(writer.meta, autopilot="sitl", success=success, gates_passed=result.gates_passed)
-    )
+    writer.finish(replace(writer.meta, success=success, gates_passed=result.gates_passed))
     return success
 
 
@@ -318,12 +319,15 @@ def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -
         policy=runner.name,
         engine=runner.engine,
         mode="dual",
+        autopilot=spec.config.autopilot,
         action_hz=Rates().loops(is_dual=True).action_hz,
         visual_hz=Rates().visual_rate,
         contract=runner.contract,
         course_seed=spec.seed,
         seed=spec.seed,
         conditions=variation.conditions.numbers(),
+        policy_files=spec.weights,
+        plan={"speed_mps": spec.config.speed, "solve_time_ms": spec.config.solve_time},
     )
 
 
@@ -399,19 +403,41 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
     """Return the episodes without a finished recording.
 
     Raises:
-        UserError: the folder of an episode holds something other than a flight.
+        UserError: the folder of an episode holds another flight, or something else.
+        FlightError: the folder of an episode holds a meta.json that is damaged or not ours.
     """
+    weights = digests(policy_files(config.policy)) if config.policy.checkpoint else {}
     specs = []
     for index in range(config.episodes):
-        folder = config.out / f"{index:06d}"
+        folder, seed = config.out / f"{index:06d}", config.first_course_seed + index
+        spec = DemonstrationSpec(folder=folder, seed=seed, config=config, weights=weights)
         if folder.is_dir() and any(folder.iterdir()):
             if not (folder / META).is_file():
                 raise UserError(f"{folder} is no recorded flight: name another --out")
-            try:
-                if read_meta(folder).finished:
-                    continue
-            except FlightError:
-                pass  # cut off while being written
-        seed = config.first_course_seed + index
-        specs.append(DemonstrationSpec(folder=folder, seed=seed, config=config))
+            meta = read_meta(folder)
+            if differences := _differences(meta, spec):
+                raise UserError(
+                    f"{folder} holds another flight ({differences}): name another --out"
+                )
+            if meta.finished:
+                continue
+        specs.append(spec)
     return specs
+
+
+def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
+    """Return how a recorded flight differs from the one to fly, in words; empty if it does not."""
+    config = spec.config
+    pairs = {
+        "source": (meta.source, "dagger" if config.policy.checkpoint else "demonstration"),
+        "course seed": (meta.course_seed, spec.seed),
+        "--autopilot": (meta.autopilot, config.autopilot),
+        "--action": (meta.contract and meta.contract.action, config.action),
+        "--speed": (meta.plan.get("speed_mps"), config.speed),
+        "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
+        "--checkpoint": tuple(
+            " ".join(sorted(digest[:8] for digest in files.values())) or "none"
+            for files in (meta.policy_files, spec.weights)
+        ),
+    }
+    return "; ".join(f"{name} {was}, not {now}" for name, (was, now) in pairs.items() if was != now)

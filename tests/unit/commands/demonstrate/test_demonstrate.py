@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +23,11 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.meta import write_meta
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.data.flight_data import ActionTerms
 from policy.data.flight_folders import read_flight
-from policy.loading.builtin import SHIPPED
+from policy.loading.builtin import SHIPPED, SHIPPED_RATES
 from policy.nets.toge import TogeConfig
 from policy.training.settings import TrainSettings
 
@@ -97,7 +99,7 @@ def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
     shutil.copytree(flight.folder, kept)
     meta = (kept / "meta.json").read_text()
     unfinished.mkdir()
-    (unfinished / "meta.json").write_text(meta.replace('"finished": true', '"finished": false'))
+    write_meta(unfinished, replace(flight.meta, finished=False, course_seed=30_001))
     (unfinished / "ticks.arrows").write_bytes(b"")
     assert demonstrate(config(tmp_path, episodes=2, max_time=1.0)) == 0
     assert (kept / "meta.json").read_text() == meta
@@ -108,6 +110,28 @@ def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
     sent_ns = again.ticks["sent_ns"].to_pylist()
     # A flight that starts in the air is recorded from 0.3 s on.
     assert 0.5e9 < sent_ns[-1] - sent_ns[0] < 1.1e9
+
+
+@pytest.mark.parametrize("is_finished", [True, False])
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"courses": "race"}, "course seed 30000, not 1000030000"),
+        ({"policy": PolicyConfig(seed=4)}, "course seed 30000, not 40000"),
+        ({"action": "rates"}, "--action sticks, not rates"),
+        ({"autopilot": "px4"}, "--autopilot ardupilot, not px4"),
+        ({"speed": 9.0}, r"--speed 6\.0, not 9\.0"),
+        ({"policy": PolicyConfig(checkpoint=SHIPPED, seed=3)}, "--checkpoint none, not "),
+    ],
+)
+def test_a_flight_of_other_settings_is_neither_counted_nor_overwritten(
+    flight: RecordedFlight, tmp_path: Path, changes: dict[str, Any], said: str, is_finished: bool
+) -> None:
+    shutil.copytree(flight.folder, tmp_path / "000000")
+    write_meta(tmp_path / "000000", replace(flight.meta, finished=is_finished))
+    with pytest.raises(UserError, match=said):
+        demonstrate(replace(config(tmp_path), **changes))
+    assert (tmp_path / "000000/camera.mp4").is_file()
 
 
 def test_an_interrupted_demonstration_is_unfinished(tmp_path: Path) -> None:
@@ -133,7 +157,11 @@ def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Pat
         policy=PolicyConfig(checkpoint=SHIPPED, seed=3),
         solve_time=400.0,
     )
-    assert demonstrate(slow) == 0
+    assert demonstrate(slow) == demonstrate(slow) == 0
+    with pytest.raises(UserError, match=r"\(--solve-time 400\.0, not 300\.0\)"):
+        demonstrate(replace(slow, solve_time=300.0))
+    with pytest.raises(UserError, match=r"\(--checkpoint [0-9a-f]{8}, not [0-9a-f]{8}\)"):
+        demonstrate(replace(slow, policy=replace(slow.policy, checkpoint=SHIPPED_RATES)))
     ticks = open_flight(tmp_path / "000000").ticks
     ages_ns = np.array(ticks["sent_ns"]) - np.array(ticks["feature_captured_ns"])
     assert ages_ns.min() > 100_000_000
