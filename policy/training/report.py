@@ -16,14 +16,15 @@ class PolicyValidation:
     """Mean absolute error of the sampled sticks, in full deflections."""
     mean_stick_error: float
     """Error of always flying the mean stick of the training flights."""
-    hold_error: float
-    """Error of holding the newest stick of the history."""
+    hold_error: float | None
+    """Error of holding the newest stick of the history; None by rates, without sent sticks."""
 
     def describe(self) -> str:
         """Return one line for the user."""
+        held = "" if self.hold_error is None else f", last stick held {self.hold_error:.3f}"
         return (
             f"held-out loss {self.loss:.3f}, stick error {self.stick_error:.3f} of full deflection "
-            f"(mean stick {self.mean_stick_error:.3f}, last stick held {self.hold_error:.3f})"
+            f"(mean stick {self.mean_stick_error:.3f}{held})"
         )
 
 

@@ -174,5 +174,9 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
         weight += len(batch.state)
     loss, gate, sticks, mean, hold = (totals / weight).tolist()
     return PolicyValidation(
-        loss=loss, gate_loss=gate, stick_error=sticks, mean_stick_error=mean, hold_error=hold
+        loss=loss,
+        gate_loss=gate,
+        stick_error=sticks,
+        mean_stick_error=mean,
+        hold_error=None if trainee.policy.contract.action == "rates" else hold,
     )

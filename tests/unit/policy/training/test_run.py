@@ -73,6 +73,7 @@ def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
     held_out = result.validation
     assert held_out is not None
     assert held_out.stick_error < 0.6 * held_out.mean_stick_error
+    assert held_out.hold_error is not None
     assert held_out.stick_error < 0.6 * held_out.hold_error
     policy = load_checkpoint(result.checkpoint, fallback=NETWORK)
     assert policy.contract == replace(CONTRACT, feature_dim=256)
@@ -118,6 +119,15 @@ def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
     assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
     weights = sum(p.numel() for p in build_policy(network).parameters())
     assert result.checkpoint.stat().st_size < 2 * weights
+
+
+def test_by_rates_no_error_of_a_held_stick_is_told(flights, tmp_path):
+    by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
+    held_out = run(flights, settings(tmp_path, validations=1), network=by_rates).validation
+    assert held_out is not None
+    assert held_out.hold_error is None
+    assert "held)" not in held_out.describe()
+    assert "(mean stick" in held_out.describe()
 
 
 def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_path):
