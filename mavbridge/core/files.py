@@ -57,15 +57,14 @@ def write_output(path: Path, text: str, flag: str) -> None:
     """
     is_plain = not path.is_symlink() and (path.is_file() or not path.exists())
     try:
-        try:
-            if is_plain:
+        if is_plain:
+            try:
                 write_durably(path, text)
-        except OSError as error:
-            if error.errno not in _NOT_REPLACED:
-                raise
-            is_plain = False
-        if not is_plain:
-            path.write_text(text, encoding="utf-8")
+                return
+            except OSError as error:
+                if error.errno not in _NOT_REPLACED:
+                    raise
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UserError(
             f"cannot write {flag} {path}: {error.strerror or error}; make room there, or name "

@@ -16,6 +16,8 @@ GRACE_PERIODS = 3
 is longer, but at most 100 ms beyond the age limits and the horizon of the current chunk."""
 MAX_REFUSED = 5
 """Malformed chunks in the refusal window that end the flight, even with good ones in between."""
+_MALFORMED = (Code.EMPTY_CHUNK, Code.WRONG_KIND, Code.NOT_FINITE, Code.WRONG_SHAPE)
+"""What makes a chunk malformed; the flight process finds a wrong shape itself."""
 REFUSED_WINDOW_NS = NS_PER_S
 REFUSED_WINDOW_PERIODS = 10
 RECENT_GAPS = 8
@@ -124,9 +126,6 @@ def late(
         spent_ms=spent_ns / NS_PER_MS,
     )
     return reason if said is None else Reason(reason.code, (*reason.data, ("said", said)))
-
-
-_MALFORMED = (Code.EMPTY_CHUNK, Code.WRONG_KIND, Code.NOT_FINITE, Code.WRONG_SHAPE)
 
 
 class ChunkBuffer:

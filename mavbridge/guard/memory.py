@@ -26,8 +26,6 @@ ACT_TIMEOUT_NS = 3 * NS_PER_S
 REST_NS = 1_800 * NS_PER_MS
 """Least time that the engage switch must rest low before going high is an act. Receivers that
 dropped out for 0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
-
-
 LATE_NS = 1_500 * NS_PER_MS
 """Longest time from a request for a mode to the report of it: a heartbeat a second, and a radio."""
 
@@ -109,9 +107,9 @@ class Memory:
         """said, for it may not follow the pilot's sticks"""
         self.refusal = why
 
-    def call_off(self, _: EngagementInputs, _cause: bool) -> None:
+    def call_off(self, now: EngagementInputs, _cause: bool) -> None:
         """`--arm` is called off"""
-        self.refusal, self.act = not_engaged(because(Code.OPERATOR)), None
+        self.refuse(now, because(Code.OPERATOR))
         self.wants_arm = False
 
     def prepare(self, now: EngagementInputs, _cause: bool) -> None:

@@ -105,5 +105,5 @@ def _frames(
     if meta.finished and len(numbers) and not len(places):
         raise FlightError(f"{folder / video} holds none of {len(numbers)} images: copy it again")
     damage += more
-    table, numbers = count_lost(table.take(places), numbers[places]), numbers[places]
-    return table, tuple(numbers.tolist())
+    numbers = numbers[places]
+    return count_lost(table.take(places), numbers), tuple(numbers.tolist())
