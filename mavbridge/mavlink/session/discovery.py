@@ -125,7 +125,8 @@ class VehicleDiscovery:
 
     def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
         """Return the same vehicle at its new address, or None if it has not moved."""
-        if now_ns - self._heard_ns.get(vehicle, 0) < MOVED_NS:
+        # One that was followed to a new address may not have sent a heartbeat from there yet.
+        if now_ns - self._heard_ns.setdefault(vehicle, now_ns) < MOVED_NS:
             return None
         for other, heard_ns in self._heard_ns.items():
             if other.source == vehicle.source and now_ns - heard_ns < SETTLE_NS:

@@ -1,6 +1,7 @@
 """The parts of a session, each a state machine without I/O."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -71,6 +72,19 @@ def test_two_vehicles_of_one_id_cannot_be_told_apart() -> None:
     discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 6), S)
     with pytest.raises(PeerError, match=r"id 1 .*5.*6.*another id"):
         discovery.choose(2 * S)
+
+
+def test_a_vehicle_that_was_followed_in_flight_is_not_sought_where_it_was() -> None:
+    """Its heartbeat from there may come up to a second later."""
+    discovery, start_ns = VehicleDiscovery(target_system=0), 100 * S
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), start_ns)
+    before = discovery.choose(start_ns + 2 * S)
+    assert before is not None
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), start_ns + 2 * S)
+    followed = replace(before, address=("host", 6))
+    assert discovery.moved(followed, start_ns + 3 * S) is None
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), start_ns + 7 * S)
+    assert discovery.moved(followed, start_ns + 7 * S) == before
 
 
 @pytest.mark.parametrize(
