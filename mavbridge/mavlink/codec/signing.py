@@ -67,15 +67,14 @@ class Signing:
         """Link id of the packets that are signed."""
         self._unix_ns = unix_ns
         self._sent_ticks = state.sent_ticks
-        self._remembered = dict(state.heard_ticks)
-        self._heard: dict[Stream, int] = {}
+        self._heard = dict(state.heard_ticks)
         self.refused: Counter[Refusal] = Counter()
         """Number of refused packets by reason."""
 
     @property
     def state(self) -> SigningState:
         """State for a later process."""
-        return SigningState(self._sent_ticks, self._remembered | self._heard)
+        return SigningState(self._sent_ticks, self._heard.copy())
 
     def sign(self, packet: bytes, crc_extra: int) -> bytes:
         """Return the packet with a signature and the checksum that this requires."""
@@ -105,13 +104,11 @@ class Signing:
             return "wrong key"
         ticks = int.from_bytes(signed[-_TIMESTAMP_BYTES:], "little")
         stream = (frame.data[-SIGNATURE_BYTES], *frame.source)
-        if (newest := self._heard.get(stream)) is not None:
-            if ticks <= newest:
-                return "replayed"
-        elif ticks <= (remembered := self._remembered.get(stream, 0)):
+        if (newest := self._heard.get(stream)) is None:
+            if ticks < self.now_ticks - MOST_LAG_TICKS:
+                return "clock behind"
+        elif ticks <= newest:
             return "replayed"
-        elif not remembered and ticks < self.now_ticks - MOST_LAG_TICKS:
-            return "clock behind"
         self._heard[stream] = ticks
         # Our timestamps follow, as MAVLink demands: a vehicle refuses a sender a minute behind it.
         if ticks <= LATEST_TICKS:
