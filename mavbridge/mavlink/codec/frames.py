@@ -1,5 +1,6 @@
 """MAVLink packets in bytes: where they begin and end, their checksums, not their values."""
 
+import re
 import struct
 from binascii import crc_hqx
 from typing import NamedTuple
@@ -9,6 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.mavlink.codec.messages import Endpoint
 
 MARKER_V1, MARKER_V2 = 0xFE, 0xFD
+MARKER = re.compile(rb"[\xfd\xfe]")
+"""Start of a packet."""
 SIGNED = 0x01
 """Incompatibility flag of a signed packet."""
 SIGNATURE_BYTES = 13

@@ -1,7 +1,6 @@
 """Encoding and decoding of MAVLink packets, with range checks; no socket, no clock."""
 
 import math
-import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,15 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
-from mavbridge.mavlink.codec.frames import HEADER, MARKER_V2, SIGNED, RawPacket, checksum, frame_at
+from mavbridge.mavlink.codec.frames import (
+    HEADER,
+    MARKER,
+    MARKER_V2,
+    SIGNED,
+    RawPacket,
+    checksum,
+    frame_at,
+)
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     CommandRequest,
@@ -25,7 +32,7 @@ from mavbridge.mavlink.codec.messages import (
     Request,
     StreamRequest,
 )
-from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, UNKNOWN, UnusableError
+from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, TEXT_BYTES, UNKNOWN, UnusableError
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing
 
 _RELEASE_US = 0
@@ -33,16 +40,12 @@ _RELEASE_US = 0
 _IGNORE_US = 65535
 """RC_CHANNELS_OVERRIDE, channels 1-8: leave the channel unchanged. Not a release."""
 
-_TEXT_BYTES = 50
-"""Text length of one STATUSTEXT; a longer text is sent in pieces with a common id."""
 _TEXT_CHUNKS = 4
+"""Most pieces of a long STATUSTEXT, which have a common id."""
 
 MOST_DATAGRAM_BYTES = 4096
 """Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
 case takes 0.7 ms; the largest UDP datagram would take 10 ms."""
-_PACKET_STARTS = (b"\xfd", b"\xfe")
-"""Start bytes of MAVLink 2 and 1."""
-_MARKER = re.compile(rb"[\xfd\xfe]")
 
 
 GESTURE_Z, MOST_LOW_R = 150, 800
@@ -126,7 +129,7 @@ class Codec:
         if len(data) > MOST_DATAGRAM_BYTES:
             data = data[:MOST_DATAGRAM_BYTES]
             self.bad_data_count += 1
-        if data[:1] in _PACKET_STARTS:
+        if MARKER.match(data):
             self.forget_partial()
         elif not self._partial:
             self.bad_data_count += 1
@@ -142,12 +145,12 @@ class Codec:
                 at += len(frame.data)
                 if (message := self._decoded(frame)) is not None:
                     yield message
-            elif data[at : at + 1] in _PACKET_STARTS:
+            elif MARKER.match(data, at):
                 self._partial = data[at:]
                 return
             else:
                 self.bad_data_count += 1
-                start = _MARKER.search(data, at)
+                start = MARKER.search(data, at)
                 at = len(data) if start is None else start.start()
 
     @property
@@ -304,13 +307,13 @@ class Codec:
 
         Non-ASCII characters become question marks, since ground stations decode them differently.
         """
-        data = text.encode("ascii", "replace")[: _TEXT_BYTES * _TEXT_CHUNKS]
+        data = text.encode("ascii", "replace")[: TEXT_BYTES * _TEXT_CHUNKS]
         kind = dialect.MAVLink_statustext_message
-        if len(data) <= _TEXT_BYTES:
+        if len(data) <= TEXT_BYTES:
             return [self._pack(kind, severity, data, 0, 0)]
         self._text_id = self._text_id % 65535 + 1
         # A zero byte marks the last chunk, so an empty chunk must follow a full one.
-        chunks = [data[at : at + _TEXT_BYTES] for at in range(0, len(data) + 1, _TEXT_BYTES)]
+        chunks = [data[at : at + TEXT_BYTES] for at in range(0, len(data) + 1, TEXT_BYTES)]
         return [
             self._pack(kind, severity, chunk, self._text_id, sequence)
             for sequence, chunk in enumerate(chunks)

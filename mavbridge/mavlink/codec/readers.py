@@ -44,7 +44,7 @@ from mavbridge.mavlink.codec.messages import (
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, by standard gravity."""
 
-_TEXT_BYTES = 50
+TEXT_BYTES = 50
 """Text of one STATUSTEXT."""
 MOST_VALUE = 1e9
 """Largest angle, rate, speed, position or force in SI units: far beyond any vehicle, and its square
@@ -159,7 +159,7 @@ def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
 
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
     text = _text(m.text)
-    is_full = m.id != 0 and len(text) >= _TEXT_BYTES
+    is_full = m.id != 0 and len(text) >= TEXT_BYTES
     ended = text.rstrip("\t") if is_full else text.rstrip()  # PX4 ends its texts with a tab
     # Make terminal control codes visible.
     text = "".join(c if c.isprintable() else UNPRINTABLE for c in ended)

@@ -2,25 +2,23 @@
 
 import fcntl
 import os
-import re
 import select
 from contextlib import suppress
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.codec.frames import RawPacket, frame_at
+from mavbridge.mavlink.codec.frames import MARKER, RawPacket, frame_at
 
 _STAMP_BYTES = 8
 """Timestamp size; big-endian, unsigned."""
-_MARKER = re.compile(rb"[\xfd\xfe]")
 _PIPE_BYTES = 1 << 20
 """Half a minute of a busy link; the most that Linux grants without privileges (pipe(7))."""
 _LINK_MASK = 0b11
 
 
 class PacketPipe:
-    """``PacketLog`` that writes a telemetry log in the format of MAVProxy and ground stations.
+    """Writes a telemetry log in the format of MAVProxy and ground stations.
 
     Eight bytes precede every packet: Unix time in microseconds, big-endian. The lowest two bits are
     the link number (as in pymavlink's mavlogfile), here always 0. A record is written to the pipe
@@ -100,7 +98,7 @@ def _packet_at(data: bytes, at: int) -> RawPacket | None:
 
 def _next_sound(data: bytes, at: int, end: int) -> int:
     """Return the start of the first record in this range with a valid checksum, else ``end``."""
-    for marker in _MARKER.finditer(data, at + _STAMP_BYTES, end + _STAMP_BYTES):
+    for marker in MARKER.finditer(data, at + _STAMP_BYTES, end + _STAMP_BYTES):
         packet = frame_at(data, marker.start())
         if packet is not None and packet.is_sound:
             return marker.start() - _STAMP_BYTES
