@@ -63,20 +63,14 @@ class _Stream:
         self.is_settled, self.has_settled, self.attempts = True, True, 0
         self.is_given_up = is_given_up
 
-    def refuse(self) -> None:
-        """Go on to the next option."""
+    def refuse(self, *, is_silent: bool = False) -> None:
+        """Go on to the next option, after silence to REQUEST_DATA_STREAM, if there is one."""
         self.attempts = 0
         if not self.group.is_needed:
             self.settle(is_given_up=True)
-            return
-        self._at = (self._at + 1) % len(self._options)
-        self.is_denied = self._at == 0
-
-    def give_up_intervals(self) -> None:
-        """Go on to REQUEST_DATA_STREAM, if there is one: no SET_MESSAGE_INTERVAL is answered."""
-        self.attempts = 0
-        if not self.group.is_needed:
-            self.settle(is_given_up=True)
+        elif not is_silent:
+            self._at = (self._at + 1) % len(self._options)
+            self.is_denied = self._at == 0
         elif self.group.stream is not None:
             self._at = len(self._options) - 1
 
@@ -184,7 +178,7 @@ class StreamRequester:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
-                self._pending.give_up_intervals()
+                self._pending.refuse(is_silent=True)
         may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
         open_streams = (s for s in self._streams if not s.is_settled)
         self._pending = next((s for s in open_streams if may_repeat or not s.is_denied), None)
@@ -227,16 +221,13 @@ class StreamRequester:
             self._tell(share)
             return
         for stream in self._streams:
-            if stream.group.without and not stream.received and share is None:
-                self._tell_absence(stream)
+            is_absent = stream.group.without and not stream.received and share is None
+            if is_absent and not stream.is_absence_told:
+                stream.is_absence_told = True
+                self._report(f"{stream.group.messages[0]} does not come: {stream.group.without}")
             if stream.is_slow(span_s):
                 stream.is_settled = False
                 self.renewals += stream.group.is_needed
-
-    def _tell_absence(self, stream: _Stream) -> None:
-        if not stream.is_absence_told:
-            stream.is_absence_told = True
-            self._report(f"{stream.group.messages[0]} does not come: {stream.group.without}")
 
     def _common_share(self, span_s: float) -> float | None:
         """Return the common rate fraction of all required streams, if a full link explains it."""
