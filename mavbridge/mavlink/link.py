@@ -36,6 +36,7 @@ from mavbridge.mavlink.codec.messages import (
 )
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import Signing
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import VehicleCommands
 from mavbridge.mavlink.session.discovery import (
@@ -47,7 +48,7 @@ from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection, PacketLog
+from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -72,7 +73,7 @@ class MavlinkLink:
         clock: Clock,
         config: LinkSettings,
         *,
-        packet_log: PacketLog | None = None,
+        packet_log: PacketPipe | None = None,
         keeps_packets: bool = False,
         signing: Signing | None = None,
     ) -> None:
@@ -273,14 +274,14 @@ class MavlinkLink:
     @property
     def known_params(self) -> Mapping[str, float]:
         """The vehicle's flight-relevant parameters by name, for the report."""
-        return {} if self.vehicle is None else dict(sorted(self.vehicle.known_params.items()))
+        return {} if self.vehicle is None else dict(sorted(self.vehicle.params.values.items()))
 
     def restore(self) -> bool:
         """Let ``service`` restore the parameters set for the flight; call at every tick until True.
 
         True: everything is restored, or nothing more can be done; after some 3 s at most.
         """
-        return self.vehicle is None or self.vehicle.params.restore()
+        return self.vehicle is None or self.vehicle.params.changes.restore()
 
     def service(self) -> None:
         """Find or follow the vehicle and send due requests. Call after the sticks are sent."""

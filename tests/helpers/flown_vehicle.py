@@ -21,12 +21,10 @@ class FlownVehicle:
 
     def __init__(self, profile: Profile, calibration: RcCalibration | None = None) -> None:
         self.profile = profile
-        self.calibration = calibration
         self.identity = VehicleIdentity(
             source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=3
         )
-        self.known_params: dict[str, float] = {}
-        self.params = SimpleNamespace(is_read=True)
+        self.params = SimpleNamespace(is_read=True, calibration=calibration, values={})
         self.condition = SimpleNamespace(is_receiver_hidden=False, is_released=True)
         self.mode = profile.modes.roles.setpoint[0]
         self.armed = True
@@ -65,7 +63,7 @@ class Flight:
         self.now_ns += 10 * NS_PER_MS
         encoded = self.output.encode(action, self.session, self.now_ns)
         assert encoded is not None
-        self.output.sent(encoded, self.session, self.now_ns)
+        self.output.sent(encoded, self.now_ns)
         return encoded
 
     def receive(self, body: Body) -> None:

@@ -96,7 +96,7 @@ class ParamVehicle:
 
     def problem(self) -> Reason | None:
         report = status(self.armed, self.has_receiver)
-        return self.params.problem() or self.params.output_problem(report)
+        return self.params.changes.problem() or self.params.output_problem(report)
 
     def set_by_pilot(self, name: str, value: float) -> None:
         """Set a parameter as a ground station; the vehicle announces it to all."""

@@ -53,7 +53,7 @@ class Terms:
     @cached_property
     def values(self) -> dict[str, float]:
         """Parameters of the flight, including those of --set."""
-        return {**self.vehicle.known_params, **dict(self.config.link.set_params)}
+        return {**self.vehicle.params.values, **dict(self.config.link.set_params)}
 
     @property
     def is_sticks(self) -> bool:
@@ -151,7 +151,7 @@ def cures(notes: Iterable[ParamNote]) -> tuple[str, ...]:
 
 
 def _found(terms: Terms, name: str) -> str:
-    read, flown = terms.vehicle.known_params.get(name), terms.values.get(name)
+    read, flown = terms.vehicle.params.values.get(name), terms.values.get(name)
     if flown is None:
         return _NOT_SENT
     if read == flown:

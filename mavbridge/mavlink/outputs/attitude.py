@@ -143,7 +143,7 @@ class AttitudeOutput(SetpointOutput):
         if self._scale is None or self._sent_ns is None or now_ns - self._sent_ns > _PAUSE_NS:
             self._scale = self._thrust_scale(vehicle)
         is_boosted = isinstance(action, BodyRates) and vehicle.profile.boosts_thrust(
-            vehicle.known_params
+            vehicle.params.values
         )
         boost = self._cos_tilt if is_boosted else 1.0
         scale = self._scale * boost
@@ -202,7 +202,7 @@ class AttitudeOutput(SetpointOutput):
         return Encoded(packet, BodyRates(action.thrust, roll, pitch, yaw), shown)
 
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
-        hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.known_params)
+        hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.params.values)
         if hover is None or not PLAUSIBLE_THRUST[0] < hover < PLAUSIBLE_THRUST[1]:
             vehicle.report(
                 AdviceText(

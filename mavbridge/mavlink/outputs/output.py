@@ -47,17 +47,12 @@ class ActionOutput(ABC):
         self.echo = EchoCheck(rules)
         self.saturated: Counter[str] = Counter()
         """Number of messages, by stick, that demanded more than the vehicle can do."""
-        self._was_confirmed = False
+        self.was_confirmed = False
+        """True if the vehicle has ever been seen to act on our packets."""
 
     def restart(self) -> None:
         """Start a new session of the vehicle, in which nothing was sent or seen."""
-        self._was_confirmed |= self.echo.confirmed
         self.echo = EchoCheck(self._rules)
-
-    @property
-    def was_confirmed(self) -> bool:
-        """True if the vehicle has ever been seen to act on our packets."""
-        return self._was_confirmed or self.echo.confirmed
 
     @abstractmethod
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
@@ -67,12 +62,7 @@ class ActionOutput(ABC):
             CommandRefusedError: the action must not be sent.
         """
 
-    def refused(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note an action that could not be sent."""
-        if encoded.shown is not None:
-            self.echo.tried(now_ns)
-
-    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+    def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note an action that was sent."""
         self.saturated.update(encoded.saturated)
         if encoded.shown is not None:
@@ -81,6 +71,7 @@ class ActionOutput(ABC):
     def receive(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Process a message of the vehicle, possibly an echo, before the session does."""
         self._compare(body, vehicle, arrived_ns)
+        self.was_confirmed |= self.echo.confirmed
         if self.hides_receiver:
             vehicle.condition.is_receiver_hidden = self.echo.has_sent
             vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
@@ -99,7 +90,6 @@ class ActionOutput(ABC):
 
     def released(self) -> None:
         """Note that nothing more is sent until the next action."""
-        self._was_confirmed |= self.echo.confirmed
         self.echo.released()
 
     @property

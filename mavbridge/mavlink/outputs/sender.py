@@ -127,10 +127,11 @@ class ActionSender:
         # Before the send: a failed send may still go out.
         self._releases_left, self._release_due_ns = output.releases, 0
         if not self._connection.send(encoded.packet):
-            if not self._connection.is_down:  # a lost connection is reported as such
-                output.refused(encoded, vehicle, self._clock.now_ns())
+            # A lost connection is reported as such.
+            if not self._connection.is_down and encoded.shown is not None:
+                output.echo.tried(self._clock.now_ns())
             return None
-        output.sent(encoded, vehicle, self._clock.now_ns())
+        output.sent(encoded, self._clock.now_ns())
         return encoded.action
 
     def rehearse(
@@ -166,7 +167,7 @@ class ActionSender:
         now_ns = self._clock.now_ns()
         encoded = output.last_sticks(vehicle, now_ns)
         if encoded is not None and self._connection.send(encoded.packet):
-            output.sent(encoded, vehicle, now_ns)
+            output.sent(encoded, now_ns)
             self._note_release(is_sent=True)
 
     def try_release(self) -> bool:

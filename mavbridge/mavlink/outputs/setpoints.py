@@ -61,11 +61,11 @@ class SetpointOutput(ActionOutput):
         is_low = self._ground_ns is not None and now_ns - self._ground_ns <= self.takeoff_ns
         return shown if self._follows(vehicle, now_ns) and not is_low else None
 
-    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+    def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note an action that was sent, and expect its echo if it has one."""
         self._sent_ns = now_ns
         self._is_checked = encoded.shown is not None
-        super().sent(encoded, vehicle, now_ns)
+        super().sent(encoded, now_ns)
         if not self._is_checked:
             super().released()
 
@@ -123,7 +123,7 @@ class VelocityOutput(SetpointOutput):
             raise CommandRefusedError(f"{type(action).__name__} is no velocity")
         if not all(map(math.isfinite, action)):
             raise CommandRefusedError(f"{action} is not finite")
-        climb_mps, descent_mps = vehicle.profile.climb_limits(vehicle.known_params)
+        climb_mps, descent_mps = vehicle.profile.climb_limits(vehicle.params.values)
         down_mps = min(max(action.z_mps, -climb_mps), descent_mps)
         shown = self.echo.with_dither((round(down_mps * MM_PER_M),), now_ns)
         sent = action._replace(z_mps=shown[0] / MM_PER_M)

@@ -86,7 +86,7 @@ class StickOutput(ActionOutput):
     def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:
         if mode != self._curves_mode or now_ns >= self._curves_due_ns:
             self._curves_mode, self._curves_due_ns = mode, now_ns + _CURVES_NS
-            self._curves = vehicle.profile.stick_curves(vehicle.known_params, mode, self._gains)
+            self._curves = vehicle.profile.stick_curves(vehicle.params.values, mode, self._gains)
             for note in self._curves.notes if vehicle.params.is_read else ():
                 vehicle.report(AdviceText(note))
         return self._curves
@@ -125,7 +125,7 @@ class OverrideOutput(StickOutput):
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the override of the four sticks; return None without a calibration."""
         sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
-        calibration = vehicle.calibration
+        calibration = vehicle.params.calibration
         if calibration is None:
             return None
         shown = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
@@ -137,8 +137,8 @@ class OverrideOutput(StickOutput):
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS with the sent override."""
-        if isinstance(body, RcChannels) and vehicle.calibration is not None:
-            pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
+        if isinstance(body, RcChannels) and vehicle.params.calibration is not None:
+            pwm_us = vehicle.params.calibration.stick_channels_us(body.channels_us)
             self.echo.received(pwm_us, body.boot_us, arrived_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
@@ -243,15 +243,15 @@ class ManualControlOutput(StickOutput):
         self._pilot: Sticks | None = None
         """Sticks that the vehicle acted on when they were not ours."""
 
-    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+    def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note sticks that were sent."""
-        super().sent(encoded, vehicle, now_ns)
+        super().sent(encoded, now_ns)
         self._sent_ns = now_ns
         self._speeds.sent(self._last, now_ns)
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
         """True if our sticks are slower than a hand, by this firmware version's parameter."""
-        hand_per_s = vehicle.profile.hand_per_s(vehicle.known_params)
+        hand_per_s = vehicle.profile.hand_per_s(vehicle.params.values)
         return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:

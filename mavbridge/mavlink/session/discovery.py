@@ -72,14 +72,14 @@ class VehicleDiscovery:
             and heartbeat.vehicle_type not in _NOT_VEHICLES
             and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
         )
-        if is_vehicle and source.component != AUTOPILOT_COMPONENT:
-            self._odd_components.add(source.component)
-        elif not is_vehicle:
+        if not is_vehicle:
             kind = dialect.enums["MAV_TYPE"].get(heartbeat.vehicle_type)
             name = kind.name.removeprefix("MAV_TYPE_") if kind else str(heartbeat.vehicle_type)
             if len(self._others) < _CAPACITY:
                 self._others.add(f"{name} (system {source.system}, component {source.component})")
-        if not is_vehicle or source.component != AUTOPILOT_COMPONENT:
+            return
+        if source.component != AUTOPILOT_COMPONENT:
+            self._odd_components.add(source.component)
             return
         vehicle = VehicleIdentity(
             source=source,

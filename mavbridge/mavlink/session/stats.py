@@ -19,7 +19,8 @@ class LinkCounters:
         self._last_sequence: int | None = None
         self._lost = 0
         self._first_ns: int | None = None
-        self._last_ns = 0
+        self.heard_ns = 0
+        """Arrival of the newest message; 0 before the first."""
         self.sent = 0
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
@@ -36,12 +37,7 @@ class LinkCounters:
             self._lost += ahead - 1
             self._last_sequence = sequence
         self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
-        self._last_ns = arrived_ns
-
-    @property
-    def heard_ns(self) -> int:
-        """Arrival of the newest message; 0 before the first."""
-        return self._last_ns
+        self.heard_ns = arrived_ns
 
     def new_sequence(self) -> None:
         """Accept any sequence number next: the sender has restarted."""
@@ -58,8 +54,8 @@ class LinkCounters:
     ) -> LinkStats:
         """Return the totals; ``saturated``: messages in which each stick demanded too much."""
         received = self._by_name.total()
-        span_ns = self._last_ns - (self._first_ns or 0)
-        error_ns = timesync.error_ns(self._last_ns)
+        span_ns = self.heard_ns - (self._first_ns or 0)
+        error_ns = timesync.error_ns(self.heard_ns)
         return LinkStats(
             messages_per_s=tuple(
                 (name, count * NS_PER_S / span_ns)

@@ -4,7 +4,7 @@ A state machine without I/O. The link steps it at every tick, so that connecting
 reboot of the vehicle are handled alike, and none of them blocks the action loop.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -14,7 +14,6 @@ from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import Output, VehicleStatus, said_by_vehicle
-from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     RESTART_STAMPS,
     RESTART_STEP_US,
@@ -186,7 +185,7 @@ class VehicleSession:
         """Process one message from this vehicle."""
         self._streams.receive(message.name, arrived_ns)
         body = message.body
-        self.condition.calibration = self.calibration
+        self.condition.calibration = self.params.calibration
         self.condition.receive(body, arrived_ns)
         match body:
             case Attitude():
@@ -245,18 +244,6 @@ class VehicleSession:
         if self._receiver_due_ns is None and self._streams.is_settled:
             self._receiver_due_ns = now_ns + RECEIVER_WAIT_NS
 
-    # --- parameters
-
-    @property
-    def calibration(self) -> RcCalibration | None:
-        """Radio calibration of the flight; None until it is read, or if it is unusable."""
-        return self.params.calibration
-
-    @property
-    def known_params(self) -> Mapping[str, float]:
-        """Relevant parameters received from the vehicle, by name."""
-        return self.params.values
-
     def unfinished(self, now_ns: int) -> Reason | None:
         """Return the unfinished step of the set-up, or None."""
         if not self.params.is_read:
@@ -288,7 +275,7 @@ class VehicleSession:
             return because(Code.HEARTBEAT_LOST)
         if self._upset is not None and now_ns - self._upset[0] < _UPSET_NS:
             return self._upset[1]
-        return self.unfinished(now_ns) or self.params.problem()
+        return self.unfinished(now_ns) or self.params.changes.problem()
 
     def end_engagement(self, reason: Reason, now_ns: int) -> None:
         """Make ``problem`` return this reason, for long enough to end an engagement in order."""

@@ -1,7 +1,7 @@
 """Transport combined with the codec: receives messages, sends packets, reconnects by itself."""
 
 from collections.abc import Iterator
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
@@ -11,6 +11,7 @@ from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.readers import UNKNOWN
 from mavbridge.mavlink.codec.signing import Refusal
+from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
@@ -35,13 +36,6 @@ REFUSALS: dict[Refusal, str] = {
 }
 
 
-class PacketLog(Protocol):
-    """Receives every packet that is received or sent; must neither block nor raise."""
-
-    def put(self, packet: Packet, /) -> None:
-        """Record the packet, or drop and count it."""
-
-
 Arrival: TypeAlias = tuple[ReceivedMessage, int, Address | None]
 """Message, arrival [ns] and source address; a plain tuple for speed."""
 
@@ -54,8 +48,9 @@ class Connection:
         transport: Transport,
         codec: Codec,
         clock: Clock,
-        log: PacketLog | None = None,
+        log: PacketPipe | None = None,
     ) -> None:
+        """``log`` receives every packet that is received or sent."""
         self._transport = transport
         self._codec = codec
         self._clock = clock

@@ -12,7 +12,6 @@ from helpers.wire import CALIBRATION, WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.link_settings import LinkSettings
-from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
@@ -148,7 +147,6 @@ class Rig:
             self.vehicle,
             self.clock,
             LinkSettings(connect="udp:127.0.0.1:14550", **config),
-            packet_log=BoundedQueue(20_000),
             keeps_packets=keeps_packets,
             signing=signing,
         )

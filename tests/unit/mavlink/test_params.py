@@ -277,7 +277,7 @@ def test_px4s_parameters_are_set_with_their_type_and_put_back() -> None:
     assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (1.0, 0.3)
     kinds = {r.name: r.kind for r in vehicle.requests if isinstance(r, ParamWrite)}
     assert kinds == {"COM_RC_IN_MODE": 6, "COM_RC_LOSS_T": 9}
-    vehicle.params.restore()
+    vehicle.params.changes.restore()
     vehicle.run(3.0)
-    assert vehicle.params.restore()
+    assert vehicle.params.changes.restore()
     assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (0.0, 0.5)

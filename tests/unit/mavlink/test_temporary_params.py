@@ -17,9 +17,9 @@ def start(*, time_s: float = 3.0, **more: Any) -> ParamVehicle:
 
 
 def end(vehicle: ParamVehicle, *, within_s: float = 5.0) -> None:
-    vehicle.params.restore()
+    vehicle.params.changes.restore()
     vehicle.run(within_s)
-    assert vehicle.params.restore()
+    assert vehicle.params.changes.restore()
 
 
 def told(vehicle: ParamVehicle, text: str) -> bool:
@@ -29,7 +29,7 @@ def told(vehicle: ParamVehicle, text: str) -> bool:
 def test_a_parameter_is_set_before_the_flight_and_put_back_after_it() -> None:
     early = start()
     early.run(0.1)
-    assert early.params.restore()
+    assert early.params.changes.restore()
     early.run(6.0)
     assert early.writes == []  # the end came before anything was set
     vehicle = start(old_params={"RC_OVERRIDE_TIME": 7.0})  # of an earlier session
@@ -115,12 +115,12 @@ def test_arming_while_something_is_put_back_stops_that() -> None:
     vehicle = start()
     vehicle.run(6.0)
     vehicle.refuses.add("RC_OVERRIDE_TIME")
-    vehicle.params.restore()
+    vehicle.params.changes.restore()
     vehicle.run(0.7)
     vehicle.armed = True
     count = len(vehicle.writes)
     vehicle.run(5.0)
-    assert vehicle.params.restore()
+    assert vehicle.params.changes.restore()
     assert len(vehicle.writes) == count
     assert told(vehicle, "still armed")
 

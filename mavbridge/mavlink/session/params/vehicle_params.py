@@ -106,11 +106,10 @@ class VehicleParams:
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
         self._again_ns = 0
         self._reader.request(tuple(name for name, _ in config.set_params))
-        self._changes = TemporaryParams(
-            config.set_params,
-            before=old_params,
-            report=report,
-        )
+        self.values: Mapping[str, float] = self._reader.values
+        """Relevant parameters received from the vehicle, by name."""
+        self.changes = TemporaryParams(config.set_params, before=old_params, report=report)
+        """Parameters that are set for the flight."""
         self._follow_ups: dict[CommandRequest, tuple[int, int]] = {}
         """Number of times still to send each command, and the time of the next [ns]."""
         self._advised: ParamContext | None = None
@@ -124,11 +123,6 @@ class VehicleParams:
         """Change in flight that ends all engagements so far, or None; stays set."""
 
     @property
-    def values(self) -> Mapping[str, float]:
-        """Relevant parameters received from the vehicle, by name."""
-        return self._reader.values
-
-    @property
     def override_switch(self) -> int | None:
         """Number of the channel that enables the output, or None."""
         return self._assessed.override_switch if self._assessed else None
@@ -136,7 +130,7 @@ class VehicleParams:
     @property
     def ignores_receiver(self) -> bool:
         """True if the vehicle ignores a receiver's sticks."""
-        return self._profile.ignores_receiver(self._reader.values)
+        return self._profile.ignores_receiver(self.values)
 
     def use_output(self, output: Output) -> None:
         """Check the parameters for this output from now on."""
@@ -148,12 +142,12 @@ class VehicleParams:
             param = param.from_bytes()
         if not math.isfinite(param.value):
             return
-        old = self._reader.values.get(param.name)
+        old = self.values.get(param.name)
         self._reader.receive(param)
-        if param.name in self._reader.values:  # other names are unlimited
+        if param.name in self.values:  # other names are unlimited
             self._kinds[param.name] = param.kind
-        self._changes.receive(param)
-        if not self.is_read or old == self._reader.values.get(param.name):
+        self.changes.receive(param)
+        if not self.is_read or old == self.values.get(param.name):
             return
         if (
             old is not None
@@ -179,7 +173,7 @@ class VehicleParams:
         return ParamContext(self._output, self._config.source_system, has_receiver)
 
     def _assess(self, status: VehicleStatus | None) -> Assessment:
-        self._assessed = assess(self._profile, self._reader.values, self._context(status))
+        self._assessed = assess(self._profile, self.values, self._context(status))
         return self._assessed
 
     def step(
@@ -193,9 +187,9 @@ class VehicleParams:
             self._take_in(status)
             self._advise(status)
         if self.is_read:
-            for request in self._changes.step(
+            for request in self.changes.step(
                 now_ns,
-                self._reader.values,
+                self.values,
                 is_complete=self._reader.is_done,
                 is_disarmed=status is not None and not status.armed,
             ):
@@ -218,7 +212,7 @@ class VehicleParams:
         if now_ns < self._again_ns or is_flying:
             return
         self._again_ns = now_ns + _AGAIN_NS
-        self._reader.request(self._profile.needed_params(self._reader.values))
+        self._reader.request(self._profile.needed_params(self.values))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
@@ -235,7 +229,7 @@ class VehicleParams:
     def _advise(self, status: VehicleStatus | None) -> None:
         context = self._context(status)
         has_output = context.output is not None and self._config.pilot_hz is None
-        if not has_output or context == self._advised or not self._changes.is_settled:
+        if not has_output or context == self._advised or not self.changes.is_settled:
             return
         self._advised = context
         assessment = self._current(status)
@@ -245,10 +239,6 @@ class VehicleParams:
                 notes.append(danger.note(is_accepted=True))
         for note in notes:
             self._report(AdviceText(note.text))
-
-    def problem(self) -> Reason | None:
-        """Return why no flight may begin yet with any output, or None; once all is read."""
-        return self._changes.problem()
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:
         """Return why the parameters forbid a flight with the chosen output, or None."""
@@ -281,7 +271,3 @@ class VehicleParams:
         if self._assessed is None or self._assessed.context != self._context(status):
             return self._assess(status)
         return self._assessed
-
-    def restore(self) -> bool:
-        """Restore what was set for the flight; return True if nothing more can be done now."""
-        return self._changes.restore()

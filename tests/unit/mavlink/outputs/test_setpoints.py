@@ -69,7 +69,7 @@ def test_the_thrust_of_body_rates_is_along_the_body_whatever_the_autopilot_adds(
     profile: Profile, boost: float, factor: float
 ) -> None:
     flight = attitude_flight(profile, is_rates=True)
-    flight.vehicle.known_params["ATC_ANGLE_BOOST"] = boost
+    flight.vehicle.params.values["ATC_ANGLE_BOOST"] = boost
     leaning = quaternion_from_euler(math.radians(60.0), 0.0, 0.0)
     flight.receive(Attitude(True, 0, leaning, (0.0, 0.0, 0.0)))
     encoded = flight.send(BodyRates(0.6, 0.1, 0.2, 0.3))
@@ -115,7 +115,7 @@ def test_before_another_mode_is_left_the_heading_follows_the_vehicles() -> None:
 def test_thrust_that_hovered_in_training_hovers_here(profile: Profile) -> None:
     flight = attitude_flight(profile, hover=0.4)
     name = "MOT_THST_HOVER" if profile is ARDUPILOT else "MPC_THR_HOVER"
-    flight.vehicle.known_params = {name: 0.5}
+    flight.vehicle.params.values = {name: 0.5}
     encoded = flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0))
     message: Any = flight.message(encoded)
     assert message.thrust == pytest.approx(0.5, abs=1e-4)
@@ -134,7 +134,7 @@ def fly_by_itself(flight: Flight, thrust: float, up_mps2: float, seconds: float 
 def test_the_hover_that_was_seen_counts_more_than_the_parameter() -> None:
     for up_mps2 in (9.80665, 11.0):  # climbing faster and faster, at more thrust
         flight = attitude_flight(ARDUPILOT, hover=0.4)
-        flight.vehicle.known_params = {"MOT_THST_HOVER": 0.39}
+        flight.vehicle.params.values = {"MOT_THST_HOVER": 0.39}
         fly_by_itself(flight, 0.364 * up_mps2 / 9.80665, up_mps2)
         message: Any = flight.message(flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0)))
         assert message.thrust == pytest.approx(0.364, abs=1e-3)
@@ -143,7 +143,7 @@ def test_the_hover_that_was_seen_counts_more_than_the_parameter() -> None:
 @pytest.mark.parametrize("why", ["on the ground", "too short", "leaning", "falling"])
 def test_thrust_that_is_no_hover_is_not_learnt(why: str) -> None:
     flight = attitude_flight(ARDUPILOT, hover=0.4)
-    flight.vehicle.known_params = {"MOT_THST_HOVER": 0.4}
+    flight.vehicle.params.values = {"MOT_THST_HOVER": 0.4}
     flight.vehicle.is_landed = why == "on the ground"
     if why == "leaning":
         quaternion = quaternion_from_euler(0.5, 0.0, 0.0)
@@ -264,7 +264,7 @@ def test_px4_is_asked_for_no_climb_that_it_would_cut(
     up_mps: float, down_mps: float, asked_and_sent: tuple[tuple[float, float], ...]
 ) -> None:
     flight = velocity_flight(PX4)
-    flight.vehicle.known_params = {"MPC_Z_VEL_MAX_UP": up_mps, "MPC_Z_VEL_MAX_DN": down_mps}
+    flight.vehicle.params.values = {"MPC_Z_VEL_MAX_UP": up_mps, "MPC_Z_VEL_MAX_DN": down_mps}
     for asked, sent in asked_and_sent:
         encoded = flight.send(Velocity(0.0, 0.0, asked, 0.0))
         message: Any = flight.message(encoded)
@@ -309,7 +309,7 @@ def test_what_is_no_such_action_never_leaves() -> None:
 @BOTH
 def test_a_thrust_that_cannot_be_matched_to_the_vehicle_is_told_once(profile: Profile) -> None:
     flight = attitude_flight(profile)
-    assert flight.vehicle.profile.hover_thrust(flight.vehicle.known_params) is None
+    assert flight.vehicle.profile.hover_thrust(flight.vehicle.params.values) is None
     flight.send(LEVEL)
     (note,) = flight.vehicle.texts
     assert "hovers is not known" in note

@@ -39,7 +39,7 @@ WANTED = Sticks(throttle=0.5, yaw=0.2, pitch=0.1, roll=-0.3)
 
 def px4_flight(gains: StickGains | None = None) -> Flight:
     vehicle = FlownVehicle(PX4)
-    vehicle.mode, vehicle.known_params = "ALTCTL", dict(PX4_VALUES)
+    vehicle.mode, vehicle.params.values = "ALTCTL", dict(PX4_VALUES)
     return Flight(ManualControlOutput(codec(), gains), vehicle)
 
 
@@ -65,7 +65,7 @@ def test_the_curves_follow_the_mode_at_once_and_the_parameters_soon() -> None:
     assert flight.send(WANTED).shown[:3] == (100, -300, 750)  # type: ignore[index]
     flight.vehicle.mode = "ALTCTL"
     assert flight.send(WANTED).shown[:3] == before[:3]  # type: ignore[index]
-    flight.vehicle.known_params["MPC_MAN_TILT_MAX"] = 20.0
+    flight.vehicle.params.values["MPC_MAN_TILT_MAX"] = 20.0
     flight.now_ns += 500 * MS
     assert flight.send(WANTED).shown[1] < before[1]  # type: ignore[index]
 
