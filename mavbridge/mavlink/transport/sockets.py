@@ -106,11 +106,17 @@ _Handle = TypeVar("_Handle", socket.socket, serial.Serial)
 class _FileTransport(Transport, Generic[_Handle]):
     """Socket or port. A stream may accept part of a packet: the rest precedes the next one."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, place: str, clock: Clock) -> None:
+        self._place = place
+        """Kind and address, for messages."""
         self._clock = clock
         self._handle: _Handle | None = None
         self._unsent = b""
         self._was_open = False
+
+    def _down(self, why: Exception | str) -> TransportDownError:
+        reason = getattr(why, "strerror", None) or why
+        return TransportDownError(f"{self._place}: {reason}")
 
     def fileno(self) -> int | None:
         """See `Transport`."""
@@ -145,7 +151,7 @@ class UdpTransport(_FileTransport[socket.socket]):
     """UDP, listening (``udp:``, ``udpin:``) or calling (``udpout:``)."""
 
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
-        super().__init__(clock)
+        super().__init__(f"udp {spelled(*address)}", clock)
         self._address, self._listen = address, listen
 
     def open(self) -> None:
@@ -159,12 +165,12 @@ class UdpTransport(_FileTransport[socket.socket]):
                 udp.bind(self._address)
         except OSError as error:
             udp.close()
-            place = spelled(*self._address)
             hint = {
                 errno.EADDRINUSE: f"{_HOLDER} (ss -ulpn names it), or choose another port",
-                errno.EADDRNOTAVAIL: f"not of this computer; udpout:{place} sends there",
+                errno.EADDRNOTAVAIL: "not of this computer; "
+                f"udpout:{spelled(*self._address)} sends there",
             }.get(error.errno or 0, "check the address")
-            raise UserError(f"cannot use udp {place}: {error.strerror}; {hint}") from error
+            raise UserError(f"cannot use {self._place}: {error.strerror}; {hint}") from error
         self._handle = udp
 
     def drain(self) -> Iterator[Received]:
@@ -209,7 +215,7 @@ class TcpTransport(_FileTransport[socket.socket]):
     """TCP client (``tcp:``)."""
 
     def __init__(self, address: Address, clock: Clock) -> None:
-        super().__init__(clock)
+        super().__init__(f"tcp {spelled(*address)}", clock)
         self._address = address
         self._is_connected, self._heard_ns = False, 0
 
@@ -227,23 +233,18 @@ class TcpTransport(_FileTransport[socket.socket]):
             pass
         except OSError as error:
             tcp.close()
-            code = error.errno or errno.ETIMEDOUT
             if self._was_open:
-                raise self._down(code) from error
-            reason = f"{os.strerror(code)}: check the address and the network"
-            if code == errno.ECONNREFUSED:
+                raise self._down(error) from error
+            reason = f"{error.strerror or error}: check the address and the network"
+            if error.errno == errno.ECONNREFUSED:
                 reason = "nobody listens there: start the vehicle's end first, or check the port"
-            raise PeerError(f"cannot connect to tcp {spelled(*self._address)}: {reason}") from error
+            raise PeerError(f"cannot connect to {self._place}: {reason}") from error
         tcp.setblocking(False)
         self._handle, self._is_connected, self._was_open = tcp, False, True
         self._heard_ns = self._clock.now_ns()
 
     def _end(self, handle: socket.socket) -> None:
         handle.shutdown(socket.SHUT_RDWR)
-
-    def _down(self, code: int | None) -> TransportDownError:
-        reason = errno.errorcode.get(code or 0, code)
-        return TransportDownError(f"tcp {spelled(*self._address)}: {reason}")
 
     def drain(self) -> Iterator[Received]:
         """Yield the bytes received so far."""
@@ -255,9 +256,9 @@ class TcpTransport(_FileTransport[socket.socket]):
             except OSError as error:
                 if not self._is_connected and error.errno == errno.ENOTCONN:
                     break
-                raise self._down(error.errno) from error
+                raise self._down(error) from error
             if not data:
-                raise TransportDownError("tcp: the vehicle closed the connection")
+                raise self._down("the vehicle closed the connection")
             if not self._is_connected and sys.platform == "linux":
                 option = socket.TCP_USER_TIMEOUT
                 self._handle.setsockopt(socket.IPPROTO_TCP, option, _TCP_STALE_MS)
@@ -265,7 +266,7 @@ class TcpTransport(_FileTransport[socket.socket]):
             self._heard_ns = self._clock.now_ns()
             yield Received(data, self._heard_ns, None)
         if self._handle is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
-            raise TransportDownError(f"tcp: silent for {TCP_SILENCE_NS // NS_PER_S} s")
+            raise self._down(f"silent for {TCP_SILENCE_NS // NS_PER_S} s")
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`."""
@@ -276,14 +277,14 @@ class TcpTransport(_FileTransport[socket.socket]):
         except OSError as error:
             if error.errno in (errno.ENOTCONN, errno.EINPROGRESS):
                 return False
-            raise self._down(error.errno) from error
+            raise self._down(error) from error
 
 
 class SerialTransport(_FileTransport[serial.Serial]):
     """A serial port (``/dev/ttyX,BAUD``)."""
 
     def __init__(self, device: str, baud: int, clock: Clock) -> None:
-        super().__init__(clock)
+        super().__init__(f"serial {device}", clock)
         self._device, self._baud = device, baud
         self._backlog: deque[Received] = deque()
         """Bytes read but not yet drained."""
@@ -310,9 +311,6 @@ class SerialTransport(_FileTransport[serial.Serial]):
 
     def _end(self, handle: serial.Serial) -> None:
         fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # the lock of ``exclusive``
-
-    def _down(self, error: Exception | str) -> TransportDownError:
-        return TransportDownError(f"serial {self._device}: {error}")
 
     def drain(self) -> Iterator[Received]:
         """Yield the bytes received so far, in pieces stamped with their time on the wire."""

@@ -124,7 +124,7 @@ def test_tcp_refused_later_can_be_tried_again() -> None:
         drain_until(ours, b"x", clock)
 
     for _ in range(2):
-        with pytest.raises(TransportDownError, match="ECONNREFUSED"):
+        with pytest.raises(TransportDownError, match="refused"):
             connect()
         ours.close()
 
