@@ -35,13 +35,11 @@ from mavbridge.mavlink.codec.messages import (
     ParamWrite,
     RcChannels,
     SpecificForce,
-    StampOrder,
     StatusText,
     StreamRequest,
     SystemStatus,
     Timesync,
     VelocityTarget,
-    later_by_us,
 )
 from mavbridge.mavlink.codec.packets import (
     MOST_DATAGRAM_BYTES,
@@ -184,30 +182,38 @@ def test_each_message_is_read(message: dialect.MAVLink_message, body: Body) -> N
         assert got == (pytest.approx(wanted, abs=1e-6) if isinstance(wanted, float) else wanted)
 
 
+UNUSABLE, UNUSED = (False, 1), (False, 0)
+
+
 @pytest.mark.parametrize(
-    ("message", "is_usable"),
+    ("message", "expected"),
     [
-        (m.attitude_quaternion_encode(7, nan, 0, 0, 0, 0, 0, 0), False),
-        (m.attitude_quaternion_encode(7, 0, 0, 0, 0, 0, 0, 0), False),
-        (m.attitude_quaternion_encode(7, 1, 0, 0, 0, nan, 0, 0), False),
-        (m.attitude_encode(7, 0, inf, 0, 0, 0, 0), False),
-        (m.local_position_ned_encode(7, 0, 0, 0, 0, nan, 0), False),
-        (m.local_position_ned_encode(7, 0, 0, 0, 1e9, -1e9, 0), True),
-        (m.local_position_ned_encode(7, 0, 0, 0, 1.1e9, 0, 0), False),
-        (m.highres_imu_encode(7, nan, 0, 0, *[0.5] * 10, 8191), False),
-        (m.highres_imu_encode(7, 0, 0, 0, *[0.5] * 10, 0b111000), False),  # no accelerometer
-        (m.param_value_encode(b"RC1_MIN", nan, 9, 100, 5), False),
-        (m.manual_control_encode(1, 0, 0, 0, 0, 0), True),
-        (m.manual_control_encode(1, 1000, -1000, 1000, 1000, 0), True),
-        (m.manual_control_encode(1, 0, 0, 32767, 0, 0), False),
-        (m.manual_control_encode(1, 0, 0, -1, 0, 0), False),
+        (m.attitude_quaternion_encode(7, nan, 0, 0, 0, 0, 0, 0), UNUSABLE),
+        (m.attitude_quaternion_encode(7, 0, 0, 0, 0, 0, 0, 0), UNUSABLE),
+        (m.attitude_quaternion_encode(7, 1, 0, 0, 0, nan, 0, 0), UNUSABLE),
+        (m.attitude_encode(7, 0, inf, 0, 0, 0, 0), UNUSABLE),
+        (m.local_position_ned_encode(7, 0, 0, 0, 0, nan, 0), UNUSABLE),
+        (m.local_position_ned_encode(7, 0, 0, 0, 1e9, -1e9, 0), (True, 0)),
+        (m.local_position_ned_encode(7, 0, 0, 0, 1.1e9, 0, 0), UNUSABLE),
+        (m.highres_imu_encode(7, nan, 0, 0, *[0.5] * 10, 8191), UNUSABLE),
+        (m.highres_imu_encode(7, 0, 0, 0, *[0.5] * 10, 0b111000), UNUSABLE),  # no accelerometer
+        (m.param_value_encode(b"RC1_MIN", nan, 9, 100, 5), UNUSABLE),
+        (m.manual_control_encode(1, 0, 0, 0, 0, 0), (True, 0)),
+        (m.manual_control_encode(1, 1000, -1000, 1000, 1000, 0), (True, 0)),
+        (m.manual_control_encode(1, 0, 0, 32767, 0, 0), UNUSABLE),
+        (m.manual_control_encode(1, 0, 0, -1, 0, 0), UNUSABLE),
+        # no target, a value out of range, an unused message: no fault
+        (m.attitude_target_encode(7, 7, [nan] * 4, 1, 2, 3, 0.4), UNUSED),
+        (m.position_target_local_ned_encode(7, 1, 0, 1, 1, 1, nan, 2, -3, *[0] * 5), UNUSED),
+        (m.param_error_encode(255, 191, b"COM_RC_IN_MODE", -1, 2), UNUSED),
+        (m.system_time_encode(1, 2), UNUSED),
     ],
 )
 def test_unusable_values_are_counted_and_dropped(
-    message: dialect.MAVLink_message, is_usable: bool
+    message: dialect.MAVLink_message, expected: tuple[bool, int]
 ) -> None:
     body, bad = read(message)
-    assert (body is not None, bad) == (is_usable, not is_usable)
+    assert (body is not None, bad) == expected
 
 
 @given(
@@ -225,21 +231,6 @@ def test_every_attitude_that_is_taken_is_of_length_one(
         taken = body.ned_from_body_wxyz
         assert hypot(*taken) == pytest.approx(1.0, abs=1e-12)
         assert [norm * part for part in taken] == pytest.approx(sent_q, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        m.attitude_target_encode(7, 7, [nan] * 4, 1, 2, 3, 0.4),
-        m.position_target_local_ned_encode(7, 1, 0, 1, 1, 1, nan, 2, -3, 0, 0, 0, 0, 0.5),
-        m.param_error_encode(255, 191, b"COM_RC_IN_MODE", -1, 2),  # a value out of range
-        m.system_time_encode(1, 2),  # unused
-    ],
-)
-def test_a_target_that_is_none_and_a_message_that_is_unused_are_no_fault(
-    message: dialect.MAVLink_message,
-) -> None:
-    assert read(message) == (None, 0)
 
 
 @given(st.binary(max_size=300), st.integers(0, 20))
@@ -279,10 +270,6 @@ def test_bytes_that_begin_nothing_count_once() -> None:
     for data in (b"AT+RESET\r\n", b"x" + WireEnd().heartbeat()):  # no next piece of anything
         assert list(ours.decode_datagram(data)) == []
     assert ours.bad_data_count == 2
-    damaged = bytearray(WireEnd().pack(m.heartbeat_encode(2, 3, 0, 0, 4)))
-    damaged[-1] ^= 1
-    assert list(ours.decode(bytes(damaged))) == []
-    assert ours.bad_data_count == 3
 
 
 def test_a_message_without_a_name_keeps_its_sender_and_its_place_in_the_sequence() -> None:
@@ -496,53 +483,6 @@ def test_a_parameter_that_is_no_integer_is_written_as_it_is() -> None:
     assert ParamValue("COM_RC_LOSS_T", 0.5, 9).from_bytes().value == 0.5
     too_much = ParamWrite("SYS_AUTOSTART", 1e12, kind=6).as_bytes()
     assert ParamValue("SYS_AUTOSTART", too_much.value, 6).from_bytes().value == 2**31 - 1
-
-
-WRAP = 2**32 * 1000
-
-
-@pytest.mark.parametrize(
-    ("stamp_us", "other_us", "later_us"),
-    [
-        *((5, 3, 2), (3_000_000, 4_000_000, -1_000_000), (3_000_000, 4_000_001, -1_000_001)),
-        *((10, WRAP - 10, 20), (WRAP - 10, 10, -20)),  # across the wrap
-        *((500_000, WRAP - 500_000, 1_000_000), (500_001, WRAP - 500_000, 1_000_001 - WRAP)),
-    ],
-)
-def test_a_stamp_is_later_across_a_wrap_and_after_a_restart_earlier(
-    stamp_us: int, other_us: int, later_us: int
-) -> None:
-    assert later_by_us(stamp_us, other_us) == later_us
-
-
-@pytest.mark.parametrize(
-    ("stamps_us", "accepted"),
-    [
-        ([5, 6, 6, 5, 7], [True, True, False, False, True]),
-        ([1, 1], [True, False]),
-        ([7, 0, 5], [True, True, True]),  # 0 is no stamp
-        ([2**32 * 1000 - 10, 5, 2**32 * 1000 - 5], [True, True, False]),  # across a wrap
-        ([10**7, 9 * 10**6, 9 * 10**6], [True, False, False]),  # late by no more than a second
-        # Two far back in a row are a clock that has restarted.
-        ([10**7, 10**6, 9_900_000, 10**6, 10**6 + 1], [True, False, False, False, True]),
-    ],
-)
-def test_late_and_doubled_stamps_are_left_out_until_the_clock_has_restarted(
-    stamps_us: list[int], accepted: list[bool]
-) -> None:
-    order = StampOrder()
-    assert all(order.accepts(us) is wanted for us, wanted in zip(stamps_us, accepted, strict=True))
-
-
-def test_what_a_record_is_not_told_is_zero() -> None:
-    assert (Heartbeat(2, 3, 0, 0).system_status, RcChannels(()).boot_us) == (0, 0)
-    assert (Altitude(1.0)[1:], StatusText("x")[1:]) == ((0.0, 0), (0, 0, False))
-
-
-def test_sequence_numbers_have_no_gaps() -> None:
-    ours, reader = codec(), WireEnd()
-    data = b"".join(ours.encode_heartbeat() for _ in range(300))
-    assert [message.get_seq() for message in reader.read(data)] == [k % 256 for k in range(300)]
 
 
 @pytest.mark.parametrize("kind", [None, dialect.MAV_TYPE_GCS])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.flown_vehicle import codec
-from mavbridge.mavlink.codec.frames import checksum, frame_at
+from mavbridge.mavlink.codec.frames import checksum
 from mavbridge.mavlink.codec.messages import Body, CurrentMode, Endpoint, Event, ReceivedMessage
 from mavbridge.mavlink.codec.readers import IDS, LAYOUTS, READERS, UnusableError
 
@@ -130,37 +130,3 @@ def test_what_a_payload_has_beyond_its_layout_is_left_out(length: int) -> None:
     packet = bytes((0xFD, length, 0, 0, 0, 1, 1, position.id, 0, 0)) + bytes(length)
     (message,) = codec().decode_datagram(packet + checksum(packet[1:], position.crc_extra))
     assert message.body is not None
-
-
-# --- datagrams cut into packets, unread
-
-
-def packet(*, is_v1: bool = False, is_signed: bool = False) -> bytes:
-    vehicle = dialect.MAVLink(None, srcSystem=7, srcComponent=9)
-    if is_signed:
-        vehicle.signing.secret_key, vehicle.signing.sign_outgoing = bytes(range(32)), True
-    vehicle.seq = 3  # odd: MAVLink 1 has it where MAVLink 2 has its flags
-    return bytes(vehicle.heartbeat_encode(2, 3, 0x81, 5, 4).pack(vehicle, is_v1))
-
-
-V1, V2, SIGNED = packet(is_v1=True), packet(), packet(is_signed=True)
-EMPTY_V1 = bytes((0xFE, 0, 3, 7, 9, 200)) + b"\x12\x34"
-
-
-@pytest.mark.parametrize("whole", [V1, V2, SIGNED])
-def test_a_packet_is_cut_out_where_it_begins(whole: bytes) -> None:
-    frame = frame_at(V2 + whole + V1, len(V2))
-    assert (frame.data, frame.source) == (whole, Endpoint(7, 9))
-    assert (frame.message_id, frame.sequence, frame.payload) == (0, 3, V2[10:19])
-    assert (frame.flags, frame.is_sound) == (whole == SIGNED, True)
-    for length in range(len(whole)):
-        assert frame_at(whole[:length], 0) is None
-    for marker in (0x00, 0xFC, 0xFF):
-        assert frame_at(bytes((marker,)) + whole[1:], 0) is None
-
-
-def test_a_packet_without_a_payload_is_one_and_a_number_may_have_three_bytes() -> None:
-    frame = frame_at(EMPTY_V1, 0)
-    assert (frame.data, frame.payload, frame.message_id) == (EMPTY_V1, b"", 200)
-    data = bytes((0xFD, 1, 0, 0, 0, 7, 9, 0x01, 0x02, 0x03)) + b"x" + b"\x12\x34"
-    assert (frame_at(data, 0).message_id, frame_at(data, 0).is_sound) == (0x030201, None)
