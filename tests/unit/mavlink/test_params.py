@@ -26,9 +26,6 @@ def after_reading(vehicle: ParamVehicle) -> ParamVehicle:
     return vehicle
 
 
-# --- reading
-
-
 # --- the radio calibration
 
 

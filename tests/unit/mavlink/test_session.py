@@ -13,7 +13,6 @@ from mavbridge.core.address import LinkAddress, parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
@@ -407,52 +406,35 @@ def test_the_newest_reading_by_the_vehicles_clock_is_held(
 @pytest.mark.parametrize(
     ("sequences", "lost"),
     [
+        ((254, 255, 0, 2, 3), 1),  # a wrap is none
         ((254, 255, 1, 0, 2, 3), 0),  # overtaken
         ((254, 255, 255, 0, 0, 1), 0),  # doubled
         ((0, 2, 1, 3, 5, 6), 1),
         ((7, 6, 8, 9), 0),  # the counters began between the two
         ((0, 201, 202, 203), 200),  # an outage
+        ((5, 6, None, 99, 100), 0),  # another session
     ],
 )
-def test_a_message_out_of_order_is_not_lost(sequences: tuple[int, ...], lost: int) -> None:
-    counters, rest = LinkCounters(), {"unusable_packets": 0, "refused_signatures": 0}
+def test_gaps_in_the_sequence_are_losses(sequences: tuple[int | None, ...], lost: int) -> None:
+    counters, sync, received = LinkCounters(), TimesyncFilter(), len(sequences)
     for k, sequence in enumerate(sequences):
-        counters.receive("ATTITUDE", sequence, k * S)
-    found = counters.stats(TimesyncFilter(), echo_confirmed=None, saturated={}, **rest)
-    assert found.lost_fraction == pytest.approx(lost / (lost + len(sequences)))
-
-
-def test_losses_are_gaps_in_the_sequence() -> None:
-    counters, sync = LinkCounters(), TimesyncFilter()
-
-    def stats(saturated: dict[str, int]) -> LinkStats:
-        return counters.stats(
-            sync,
-            echo_confirmed=True,
-            unusable_packets=3,
-            refused_signatures=0,
-            saturated=saturated,
-        )
-
-    nothing = stats({})
-    assert (nothing.lost_fraction, nothing.rtt_ms, nothing.vehicle_clock_offset_ns) == (None,) * 3
-    for k, sequence in enumerate((254, 255, 0, 2, 3)):  # one lost, and a wrap that is none
-        counters.receive("ATTITUDE", sequence, k * S)
-    counters.new_sequence()
-    counters.receive("HEARTBEAT", 99, 10 * S)
-    ts1 = sync.request(S)
-    assert ts1 is not None
-    sync.receive(Timesync(tc1=S, ts1=ts1), ts1 + 2 * NS_PER_MS)
-    found = stats({"yaw": 2})
-    assert found.lost_fraction == pytest.approx(1 / 7)
-    assert found.messages_per_s == (("ATTITUDE", 0.5), ("HEARTBEAT", 0.1))
+        if sequence is None:
+            counters.new_sequence()
+            received -= 1
+        else:
+            counters.receive("ATTITUDE", sequence, k * S)
+    rest = {"unusable_packets": 0, "refused_signatures": 0, "saturated": {"yaw": 2, "pitch": 1}}
+    found = counters.stats(sync, echo_confirmed=True, **rest)
+    assert found.lost_fraction == pytest.approx(lost / (lost + received))
+    assert found.messages_per_s == (("ATTITUDE", received / (len(sequences) - 1)),)
+    # Nothing was sent: there was nothing to confirm.
+    assert (found.rtt_ms, found.echo_confirmed, found.saturated) == (None, None, ())
+    counters.sent = 8
+    exchange(sync, S, up_ns=NS_PER_MS, down_ns=NS_PER_MS)
+    found = counters.stats(sync, echo_confirmed=True, **rest)
+    assert (found.echo_confirmed, found.saturated) == (True, (("pitch", 0.125), ("yaw", 0.25)))
     assert found.rtt_ms is not None
     assert found.rtt_ms.p50 == pytest.approx(2.0, rel=0.01)
-    assert (found.unusable_packets, found.vehicle_clock_offset_ns) == (3, -NS_PER_MS)
-    assert not found.is_timesync_good
-    assert found.timesync_error_ms == pytest.approx(1 + 9e-4 * 1000, rel=1e-3)
-    # Nothing was sent: there was nothing to confirm.
-    assert (found.echo_confirmed, found.saturated) == (None, ())
-    counters.sent = 8
-    found = stats({"yaw": 2, "pitch": 1})
-    assert (found.echo_confirmed, found.saturated) == (True, (("pitch", 0.125), ("yaw", 0.25)))
+    assert (found.vehicle_clock_offset_ns, found.is_timesync_good) == (BOOT_NS, False)
+    drift_ms = (counters.heard_ns - S) / 1e4 / NS_PER_MS
+    assert found.timesync_error_ms == pytest.approx(1.0 + drift_ms, rel=1e-2)

@@ -4,7 +4,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.wire import ARDUPILOT
-from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.messages import Endpoint, ParamWrite
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import EPOCH_NS, LATEST_TICKS, TICK_NS, Signing, SigningState
@@ -129,14 +128,6 @@ def test_refused_is_what_the_key_has_not_signed_or_not_just_now(packets, accepte
     assert len(names(without_key, *packets)) == len(packets)
 
 
-def test_a_stream_of_bytes_is_judged_packet_by_packet():
-    codec, vehicle, stranger = make_codec(), make_vehicle(), make_vehicle(None)
-    data = heartbeat(vehicle) + attitude(stranger) + attitude(vehicle)
-    assert [message.name for message in codec.decode(data)] == ["HEARTBEAT", "ATTITUDE_QUATERNION"]
-    assert codec.refused_signatures == 1
-    assert codec.signing.refused == {"unsigned": 1}
-
-
 def test_a_known_stream_goes_on_where_it_was_however_late_its_clock_is():
     """A vehicle without GPS goes on counting from where its last flight has ended."""
     days_ago = NOW_TICKS - 3 * 24 * 60 * MINUTE_TICKS
@@ -191,10 +182,3 @@ def test_our_timestamps_follow_a_vehicle_whose_clock_is_ahead(key, ticks, answer
     assert timestamp(reply) == answered_at
     if answered_at > NOW_TICKS:
         assert vehicle.decode(bytearray(reply)).get_type() == "HEARTBEAT"
-
-
-def test_a_judgement_is_a_bool_and_the_first_timestamp_is_one_before_2015():
-    early = Signing(KEY, unix_ns=TimeOfDay(0), state=SigningState())
-    packet = make_codec(None).encode_heartbeat()
-    assert early.accepts(frame_at(packet, 0)) is False
-    assert timestamp(early.sign(packet, dialect.MAVLink_heartbeat_message.crc_extra)) == 1

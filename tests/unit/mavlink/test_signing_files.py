@@ -92,15 +92,6 @@ def kill(store):
     store.path.write_text(text)
 
 
-def test_no_clean_start_moves_the_timestamps_ahead_of_the_time_of_day(tmp_path):
-    newest = 0
-    for _ in range(12):
-        with make_store(tmp_path) as signing:
-            ticks = sign_one(signing)
-            assert newest < ticks <= signing.now_ticks + 100
-        newest = ticks
-
-
 def test_kills_never_repeat_a_timestamp_and_gain_no_more_than_packets_could_take(tmp_path):
     newest = 0
     for number in range(12):
