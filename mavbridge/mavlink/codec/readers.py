@@ -238,32 +238,29 @@ class Layout(NamedTuple):
         return READERS[self.name](self.fields._make(self.pick(values)))
 
 
-def _layout(name: str, format_: str, fields: Sequence[str], lengths: Sequence[int]) -> Layout:
-    """Return a layout; ``lengths``: numbers in each field, more than one for an array."""
+def _layout(name: str, format_: str, fields: Sequence[str], lengths: Sequence[int] = ()) -> Layout:
+    """Return a layout; ``lengths``: numbers in each field if there are arrays, else empty."""
     places: list[int | slice] = []
     at = 0
-    for length in lengths:
+    for length in lengths or (1,) * len(fields):
         places.append(at if length == 1 else slice(at, at + length))
         at += length
     return Layout(name, struct.Struct(format_), itemgetter(*places), namedtuple(name, fields))
 
 
 LAYOUTS = {
-    message.id: _layout(
-        *(message.msgname, message.unpacker.format, message.ordered_fieldnames, message.lengths)
-    )
-    for message in dialect.mavlink_map.values()
-    if message.msgname in READERS
+    m.id: _layout(m.msgname, m.unpacker.format, m.ordered_fieldnames, m.lengths)
+    for m in dialect.mavlink_map.values()
+    if m.msgname in READERS
 } | {
     # On the wire, fields are sorted by decreasing size.
     CURRENT_MODE: _layout(
-        *("CURRENT_MODE", "<IIB", ("custom_mode", "intended_custom_mode", "standard_mode")),
-        (1, 1, 1),
+        "CURRENT_MODE", "<IIB", ("custom_mode", "intended_custom_mode", "standard_mode")
     ),
     EVENT: _layout(
-        *("EVENT", "<IIHBBB40s"),
+        "EVENT",
+        "<IIHBBB40s",
         ("id", "time_boot_ms", "sequence", "component", "system", "log_levels", "arguments"),
-        (1,) * 7,
     ),
 }
 """Layout of each message that is read, by its number."""
