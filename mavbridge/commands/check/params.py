@@ -44,11 +44,12 @@ class Terms:
 
     @cached_property
     def context(self) -> ParamContext:
-        """Output, system id and receiver of the flight."""
+        """Output, system id, receiver, accepted risks and serial port of the flight."""
         link = self.config.link
         kind: ActionKind = "sticks" if self.contract is None else self.contract.action
         output = self.profile.outputs[kind] if link.output == "auto" else link.output
-        return ParamContext(output, link.source_system, self.has_receiver)
+        serial = serial_dangers(self.settings, self.streams)
+        return ParamContext(output, link.source_system, self.has_receiver, link.accept_risk, serial)
 
     @cached_property
     def values(self) -> dict[str, float]:
@@ -90,26 +91,12 @@ class Terms:
         if self.assessment.unusable is not None:
             unusable = because(Code.CALIBRATION_UNUSABLE, cause=self.assessment.unusable)
             notes.append(ParamNote("obstacle", (), str(unusable)))
-        return notes + self._dangers(is_accepted=False)
-
-    def warnings(self) -> list[ParamNote]:
-        """Return the flight's warnings, and hints that only a check gives."""
-        notes = (note for note in self.assessment.notes if note.kind != "obstacle")
-        return [*self._dangers(is_accepted=True), *notes]
-
-    def _dangers(self, *, is_accepted: bool) -> list[ParamNote]:
-        """Return notes about the risks that the user has accepted, or has not."""
-        serial = serial_dangers(self.settings, self.streams)
-        return [
-            danger.note(is_accepted=is_accepted)
-            for danger in (*serial, *self.assessment.dangers)
-            if (danger.risk in self.config.link.accept_risk) is is_accepted
-        ]
+        return notes + [danger.note(is_accepted=False) for danger in self.assessment.refused]
 
 
 def param_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield every relevant parameter, then the motion at full stick."""
-    refusals, warnings = terms.refusals(), terms.warnings()
+    refusals, warnings = terms.refusals(), list(terms.assessment.warnings)
     told: list[ParamNote] = []
     wanted = terms.profile.wanted_params(terms.values, terms.context)
     for name, should_be in wanted.items():

@@ -21,6 +21,7 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     stick_notes,
 )
 from mavbridge.mavlink.profiles.profile import (
+    LONGEST_S,
     NO_HEALTH,
     NO_LANDING,
     NO_POSITION_WORD,
@@ -30,6 +31,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamNote,
     Profile,
     StreamGroup,
+    long_timeout,
 )
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
@@ -49,8 +51,6 @@ _THRUST_AS_THRUST = 8
 """Bit 3 of GUID_OPTIONS; without it, thrust in SET_ATTITUDE_TARGET is a climb rate."""
 _CONTINUE_LANDING = 8
 """Bit 3 of FS_OPTIONS."""
-_LONGEST_S = 1.0
-"""Longest useful timeout; a longer one leaves the vehicle uncontrolled longer than necessary."""
 
 _OLD_NAMES = {
     "MAV_GCS_SYSID": "SYSID_MYGCS",
@@ -195,13 +195,13 @@ class ArduPilot(Profile):
                     f"{context.source_system}, our system id"
                 ),
                 "RC_OPTIONS": "bit 1 clear",
-                "RC_OVERRIDE_TIME": f"0.5; above 0, at most {_LONGEST_S:g} s",
+                "RC_OVERRIDE_TIME": f"0.5; above 0, at most {LONGEST_S:g} s",
                 **dict.fromkeys(SIMPLE_NAMES, "0"),
                 "FS_THR_ENABLE": "not 0" if context.has_receiver else "not 0, without a receiver",
                 "FS_OPTIONS": "any" if context.has_receiver else "24 (bit 3 set)",
             } | ({} if switch is None else {f"RC{switch}_OPTION": "46, with its switch on"})
         wanted = {
-            "GUID_TIMEOUT": f"0.5; at most {_LONGEST_S:g} s",
+            "GUID_TIMEOUT": f"0.5; at most {LONGEST_S:g} s",
             "FS_THR_ENABLE": "not 0" if context.has_receiver else "0",
         }
         if context.output in ("attitude", "rates"):
@@ -257,11 +257,7 @@ def _override_notes(
         if missing := [name for name in names if name not in values]:
             said = f"the vehicle has not sent {', '.join(missing)}: whether {unknown} is not known"
             yield ParamNote("advice", tuple(missing), said)
-    if time_s > _LONGEST_S:
-        held = (
-            ": if this computer died, the vehicle would hold its last sticks for that many seconds"
-        )
-        yield ParamNote.of("advice", "RC_OVERRIDE_TIME", time_s, held, 0.5)
+    yield from long_timeout(values, "RC_OVERRIDE_TIME", "hold its last sticks")
     landing = values.get("FS_OPTIONS", _CONTINUE_LANDING)
     if context.has_receiver is False and not int(landing) & _CONTINUE_LANDING:
         effect = ": without a receiver, a landing turns into RTL when the sticks end"
@@ -286,13 +282,7 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
             effect = ", with which it takes our thrust for a climb rate"
             mended = int(options) | _THRUST_AS_THRUST
             yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
-    timeout_s = values.get("GUID_TIMEOUT", 0.0)
-    if timeout_s > _LONGEST_S:
-        held = (
-            ": if this computer died, the vehicle would hold its last setpoint for that many "
-            "seconds"
-        )
-        yield ParamNote.of("advice", "GUID_TIMEOUT", timeout_s, held, 0.5)
+    yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint")
     if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
         yield ParamNote(
             "advice",

@@ -133,6 +133,17 @@ class ParamNote(NamedTuple):
         return self.said if is_complete else f"{self.said}: use {self.cure}{self.or_else}"
 
 
+LONGEST_S = 1.0
+"""Longest useful timeout; a longer one leaves the vehicle uncontrolled longer than necessary."""
+
+
+def long_timeout(values: Mapping[str, float], name: str, does: str) -> Iterator[ParamNote]:
+    """Yield advice if the vehicle would go on for too long after the death of the guard."""
+    if (time_s := values.get(name, 0.0)) > LONGEST_S:
+        effect = f": if this computer died, the vehicle would {does} for that many seconds"
+        yield ParamNote.of("advice", name, time_s, effect, 0.5)
+
+
 class Danger(NamedTuple):
     """Setting with which the vehicle flies, but not safely."""
 
@@ -170,6 +181,9 @@ class ParamContext(NamedTuple):
     """Our MAVLink system id."""
     has_receiver: bool | None
     """As in ``VehicleStatus``."""
+    accepted_risks: tuple[Risk, ...] = ()
+    serial: tuple[Danger, ...] = ()
+    """Dangers of the serial port."""
 
 
 class Profile(ABC):

@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.profile import (
+    LONGEST_S,
     NO_HEALTH,
     NO_LANDING,
     NO_POSITION_WORD,
@@ -23,6 +24,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamNote,
     Profile,
     StreamGroup,
+    long_timeout,
 )
 from mavbridge.mavlink.profiles.sticks import (
     IDENTITY,
@@ -57,7 +59,6 @@ _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
 """Values of COM_OBL_RC_ACT."""
 _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
 """Bits of COM_RCL_EXCEPT: modes in which the loss of sticks is no failsafe."""
-_LONGEST_S = 1.0
 _SHORTEST_S = 0.3
 """Shortest safe timeout: a guard on a busy computer may be late by a tenth of it, and a link may
 lose a few packets in a row."""
@@ -242,7 +243,7 @@ class Px4(Profile):
 
     def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
         """See `Profile`."""
-        time = f"0.5; {_SHORTEST_S:g} to {_LONGEST_S:g} s"
+        time = f"0.5; {_SHORTEST_S:g} to {LONGEST_S:g} s"
         if context.output == "manual-control":
             return {
                 "COM_RC_IN_MODE": "1, or 6 with a receiver",
@@ -369,14 +370,8 @@ def _end_notes(
     values: Mapping[str, float], time: str, action: str, fatal: Mapping[int, str]
 ) -> Iterator[ParamNote]:
     """Yield unexpected effects of the end of our packets, by two parameters."""
-    time_s = values.get(time, _LONGEST_S)
-    if time_s > _LONGEST_S:
-        effect = (
-            ": if this computer died, the vehicle would go on with the last it was told for that "
-            "many seconds"
-        )
-        yield ParamNote.of("advice", time, time_s, effect, 0.5)
-    if time_s < _SHORTEST_S:
+    yield from long_timeout(values, time, "go on with the last it was told")
+    if (time_s := values.get(time, LONGEST_S)) < _SHORTEST_S:
         effect = ": a pause of our packets as short as that is a failsafe"
         yield ParamNote.of("advice", time, time_s, effect)
     if (value := values.get(action, 0.0)) in fatal:

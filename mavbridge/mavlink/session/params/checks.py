@@ -1,6 +1,6 @@
 """Checks of the parameters and of a serial port's capacity, for a flight with one output."""
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.address import serial_baud
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import Risk
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.frames import SIGNATURE_BYTES
 from mavbridge.mavlink.codec.readers import IDS
@@ -41,23 +40,29 @@ class Assessment(NamedTuple):
     override_switch: int | None
     """Number of the channel that enables the output."""
     notes: tuple[ParamNote, ...]
-    dangers: tuple[Danger, ...]
-    """All dangers, including accepted ones."""
+    refused: tuple[Danger, ...]
+    """Dangers that the user has not accepted."""
+    accepted: tuple[Danger, ...]
 
     @property
     def obstacles(self) -> tuple[ParamNote, ...]:
         """Reasons why the vehicle would not follow our commands."""
         return tuple(note for note in self.notes if note.kind == "obstacle")
 
-    def endangers(self, before: "Assessment", *, accepted: Container[Risk]) -> bool:
+    @property
+    def warnings(self) -> tuple[ParamNote, ...]:
+        """Accepted dangers, advice and hints."""
+        dangers = (danger.note(is_accepted=True) for danger in self.accepted)
+        return (*dangers, *(note for note in self.notes if note.kind != "obstacle"))
+
+    def endangers(self, before: "Assessment") -> bool:
         """True if these parameters must end a flight that began with ``before``."""
-        new_risks = {danger.risk for danger in self.dangers} - {d.risk for d in before.dangers}
         return (
             self.calibration != before.calibration
             or self.override_switch != before.override_switch
             or not {each.names for each in self.obstacles}
             <= {each.names for each in before.obstacles}
-            or any(risk not in accepted for risk in new_risks)
+            or not {each.risk for each in self.refused} <= {each.risk for each in before.refused}
         )
 
 
@@ -70,13 +75,15 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
         ours = profile.calibration(values)
     except ValueError as error:
         unusable = str(error) if is_override else None
+    dangers = (*context.serial, *profile.dangers(values, context))
     return Assessment(
         context,
         ours,
         unusable,
         profile.override_switch(values) if is_override else None,
         tuple(profile.notes(values, context)),
-        tuple(profile.dangers(values, context)),
+        refused=tuple(each for each in dangers if each.risk not in context.accepted_risks),
+        accepted=tuple(each for each in dangers if each.risk in context.accepted_risks),
     )
 
 

@@ -159,7 +159,7 @@ class VehicleParams:
         is_armed = status is not None and status.armed
         if not is_armed or old is None or before is None:
             return
-        if after.endangers(before, accepted=self._config.accepted_risks):
+        if after.endangers(before):
             self.interruption = because(
                 Code.PARAMETER_CHANGED, name=param.name, before=old, after=param.value
             )
@@ -169,8 +169,10 @@ class VehicleParams:
         self._reader.absent(name)
 
     def _context(self, status: VehicleStatus | None) -> ParamContext:
-        has_receiver = None if status is None else status.has_receiver
-        return ParamContext(self._output, self._config.source_system, has_receiver)
+        has_receiver, config = None if status is None else status.has_receiver, self._config
+        return ParamContext(
+            self._output, config.source_system, has_receiver, config.accepted_risks, self._serial
+        )
 
     def _assess(self, status: VehicleStatus | None) -> Assessment:
         self._assessed = assess(self._profile, self.values, self._context(status))
@@ -232,13 +234,9 @@ class VehicleParams:
         if not has_output or context == self._advised or not self.changes.is_settled:
             return
         self._advised = context
-        assessment = self._current(status)
-        notes = [note for note in assessment.notes if note.kind == "advice"]
-        for danger in (*self._serial, *assessment.dangers):
-            if danger.risk in self._config.accepted_risks:
-                notes.append(danger.note(is_accepted=True))
-        for note in notes:
-            self._report(AdviceText(note.text))
+        for note in self._current(status).warnings:
+            if note.kind == "advice":
+                self._report(AdviceText(note.text))
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:
         """Return why the parameters forbid a flight with the chosen output, or None."""
@@ -261,10 +259,7 @@ class VehicleParams:
             return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
         if self._output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
-        for danger in (*self._serial, *assessment.dangers):
-            if danger.risk not in self._config.accepted_risks:
-                return danger.refusal
-        return None
+        return assessment.refused[0].refusal if assessment.refused else None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
         """Return the assessment for the present output and receiver."""
