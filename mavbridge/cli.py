@@ -210,7 +210,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
     """Record an expert's flights of simulated courses to learn from."""
     require_extra("demonstrate")
     require_packages("demonstrate", SIMULATOR)
-    from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
+    from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
 
     return run_demonstrations(config)
 

@@ -1,0 +1,1 @@
+"""``mavbridge demonstrate``: flights of simulated gate courses, flown or labelled by an expert."""

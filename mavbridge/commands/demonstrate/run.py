@@ -1,0 +1,251 @@
+"""``mavbridge demonstrate``: fly, record and label the episodes that are missing."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from shutil import rmtree
+
+from rich.console import Console
+from rich.text import Text
+
+import mavbridge
+from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
+from mavbridge.commands.episode_workers import fly_jobs
+from mavbridge.commands.output import progress_bar
+from mavbridge.config.episodes import DemonstrateConfig
+from mavbridge.config.rates import SIM_CAMERA_PX, Rates
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import UserError
+from mavbridge.core.provenance import digests
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
+from mavbridge.flight.policies import load_for_episodes, policy_files
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.folder import META, prepare_folder
+from mavbridge.recording.meta import FlightMeta, read_meta
+from mavbridge.recording.rows import FrameTruth
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from mavbridge.simulation.world import Exposure, make_vehicle
+from policy.contract import Contract
+from policy.protocol import PolicyRunner
+from sitl.course import gate_truth
+
+ENDLESS_LAPS = 1000
+RATE_TILT_DEG = 80.0
+"""Tilt limit of a policy that learns from a body-rate expert, which leans by up to 62 degrees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemonstrationSpec:
+    """A demonstration to fly."""
+
+    folder: Path
+    """Its contents are replaced."""
+    seed: int
+    config: DemonstrateConfig
+    weights: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the student's files, by absolute path."""
+
+    def __str__(self) -> str:
+        return f"demonstration {self.seed}"
+
+
+def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) -> bool:
+    """Fly and record one course; return True if it was finished.
+
+    Raises:
+        EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished flight.
+        MavbridgeError: it cannot be flown or recorded.
+    """
+    rmtree(spec.folder, ignore_errors=True)
+    prepare_folder(spec.folder, "--out")
+    config = spec.config
+    longest_solve_ns = round(config.solve_time * NS_PER_MS)
+    variation = draw_variation(spec.seed, longest_solve_ns=longest_solve_ns)
+    with ExitStack() as stack:
+        contract, student = _terms(config, longest_solve_ns, stack)
+        flight = SimulatedFlight(
+            course_seed=spec.seed,
+            seed=spec.seed,
+            laps=ENDLESS_LAPS if config.courses == "loop" else 1,
+            # The expert uses no image: frames are drawn in the size of the recording.
+            settings=SimulationSettings(
+                delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
+            ),
+            vehicle=make_vehicle(autopilot=config.autopilot, conditions=variation.conditions),
+        )
+        pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
+        meta = _meta(spec, variation, pilot.runner)
+        writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
+        stack.callback(writer.close)
+        result = flight.fly(
+            pilot.runner,
+            max_time_s=config.max_time,
+            run_out_s=variation.hover_s,
+            ends_by_stop=False,
+            sinks=(_LabelledRecorder(flight, pilot, writer),),
+            should_stop=should_stop,
+        )
+        log = flight.vehicle.log
+        success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
+        writer.finish(replace(writer.meta, success=success, gates_passed=result.gates_passed))
+    return success
+
+
+def _terms(
+    config: DemonstrateConfig, longest_solve_ns: int, stack: ExitStack
+) -> tuple[Contract, PolicyRunner | None]:
+    """Return the contract of the flight and the student, if one flies; ``stack`` closes it."""
+    wanted = config.policy
+    if wanted.checkpoint is None:
+        size_px = wanted.image_size or SIM_CAMERA_PX
+        contract = Contract(
+            feature_dim=1,
+            arrays="numpy",
+            image_height=size_px,
+            image_width=size_px,
+            action=config.action,
+            max_tilt_deg=RATE_TILT_DEG if config.action == "rates" else None,
+            stops_at_end=True,
+        )
+        return contract, None
+    loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
+    student = stack.enter_context(loaded).runner
+    if student.contract.action != config.action:
+        action = student.contract.action
+        raise UserError(f"{wanted.checkpoint} flies by {action}: use --action {action}")
+    max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
+    contract = replace(student.contract, max_feature_age_s=max_age_s, stops_at_end=True)
+    return contract, replace(student, contract=contract)
+
+
+def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -> FlightMeta:
+    return FlightMeta(
+        started_at=datetime.now(UTC).isoformat(),
+        start_ns=0,
+        mavbridge_version=mavbridge.__version__,
+        source="dagger" if spec.config.policy.checkpoint else "demonstration",
+        policy=runner.name,
+        engine=runner.engine,
+        mode="dual",
+        autopilot=spec.config.autopilot,
+        action_hz=Rates().loops(is_dual=True).action_hz,
+        visual_hz=Rates().visual_rate,
+        contract=runner.contract,
+        course_seed=spec.seed,
+        seed=spec.seed,
+        conditions=variation.conditions.numbers(),
+        policy_files=spec.weights,
+        plan={"speed_mps": spec.config.speed, "solve_time_ms": spec.config.solve_time},
+    )
+
+
+class _LabelledRecorder:
+    """``TickSink`` that records the flight with labels, from the start of the demonstration."""
+
+    def __init__(self, flight: SimulatedFlight, pilot: Pilot, writer: FlightWriter) -> None:
+        self._flight = flight
+        self._pilot = pilot
+        self._writer = writer
+        self._truths: dict[int, FrameTruth] = {}
+        self._ticks = self._frames = 0
+        self._chunk_serial = 0
+        flight.watch_exposures(self._keep_truth)
+
+    def _keep_truth(self, exposure: Exposure) -> None:
+        body = exposure.body
+        position_ned_m, ned_from_body_wxyz = body.position_ned_m, body.ned_from_body_wxyz
+        next_gate = self._flight.vehicle.log.next_gate
+        gates = gate_truth(self._flight.course, next_gate, position_ned_m, ned_from_body_wxyz)
+        self._truths[exposure.frame_id] = FrameTruth(
+            position_ned_m=position_ned_m,
+            ned_from_body_wxyz=ned_from_body_wxyz,
+            velocity_ned_mps=body.velocity_ned_mps,
+            **asdict(gates),
+        )
+
+    def emit(self, event: Event) -> None:
+        """Record a frame, or the first send of a chunk: one row per decision of the policy.
+
+        Numbers count from the first recorded one.
+        """
+        from_ns = self._pilot.begin_ns
+        if from_ns is None:
+            return
+        if not isinstance(event, Tick):
+            if event.captured_ns >= from_ns:
+                truth = self._truths.pop(event.frame_id, None)
+                self._writer.frame(replace(event, serial=self._frames), truth)
+                self._frames += 1
+        elif event.woke_ns >= from_ns and event.chunk_serial not in (None, self._chunk_serial):
+            self._chunk_serial = event.chunk_serial
+            label = self._pilot.expert_actions.pop(event.chunk_serial, None)
+            self._writer.tick(replace(event, serial=self._ticks), label)
+            self._ticks += 1
+
+
+def demonstrate(config: DemonstrateConfig) -> int:
+    """Fly every episode that is not recorded yet; return 130 if interrupted, to be resumed."""
+    console = Console(stderr=True, emoji=False)
+    specs = _missing(config)
+    done = config.episodes - len(specs)
+    if done:
+        console.print(Text(f"{done} of {config.episodes} are there already", style="dim"))
+    successes = 0
+    with stop_on_signals() as stop, progress_bar(console) as progress:
+        bar = progress.add_task("demonstrating", total=config.episodes, completed=done, status="")
+        flown = fly_jobs(fly_demonstration, specs, config.workers, stop.is_set)
+        for count, (_, success) in enumerate(flown, start=1):
+            successes += success
+            progress.update(bar, advance=1, status=f"{successes} of {count} finished the course")
+        was_stopped = stop.is_set()
+    if was_stopped:
+        console.print(Text("interrupted: run the same command to resume", style="yellow"))
+        return INTERRUPTED
+    return 0
+
+
+def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
+    """Return the episodes without a finished recording.
+
+    Raises:
+        UserError: the folder of an episode holds another flight, or something else.
+        FlightError: the folder of an episode holds a meta.json that is damaged or not ours.
+    """
+    weights = digests(policy_files(config.policy)) if config.policy.checkpoint else {}
+    specs = []
+    for index in range(config.episodes):
+        folder, seed = config.out / f"{index:06d}", config.first_course_seed + index
+        spec = DemonstrationSpec(folder=folder, seed=seed, config=config, weights=weights)
+        if folder.is_dir() and any(folder.iterdir()):
+            if not (folder / META).is_file():
+                raise UserError(f"{folder} is no recorded flight: name another --out")
+            meta = read_meta(folder)
+            if differences := _differences(meta, spec):
+                raise UserError(
+                    f"{folder} holds another flight ({differences}): name another --out"
+                )
+            if meta.finished:
+                continue
+        specs.append(spec)
+    return specs
+
+
+def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
+    """Return how a recorded flight differs from the one to fly, in words; empty if it does not."""
+    config = spec.config
+    pairs = {
+        "source": (meta.source, "dagger" if config.policy.checkpoint else "demonstration"),
+        "course seed": (meta.course_seed, spec.seed),
+        "--autopilot": (meta.autopilot, config.autopilot),
+        "--action": (meta.contract and meta.contract.action, config.action),
+        "--speed": (meta.plan.get("speed_mps"), config.speed),
+        "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
+        "--checkpoint": tuple(
+            " ".join(sorted(digest[:8] for digest in files.values())) or "none"
+            for files in (meta.policy_files, spec.weights)
+        ),
+    }
+    return "; ".join(f"{name} {was}, not {now}" for name, (was, now) in pairs.items() if was != now)
