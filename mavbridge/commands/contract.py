@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from rich.console import Console
-
 from mavbridge.commands.config import ContractConfig
+from mavbridge.commands.output import text_console
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import write_output
 from policy.adapters.drafts import (
@@ -32,7 +31,7 @@ def contract(source: Path, config: ContractConfig) -> int:
         raise UserError(f"{out} is there already: change that, or name another file by --out")
     text, summary = _draft(source, config.dataset)
     write_output(out, text, "--out")
-    Console(highlight=False, emoji=False, markup=False).print(f"{out}: {summary}", soft_wrap=True)
+    text_console().print(f"{out}: {summary}", soft_wrap=True)
     return 0
 
 

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.output import make_table, progress_bar
+from mavbridge.commands.output import make_table, progress_bar, text_console
 from mavbridge.config.episodes import (
     COURSE_SEEDS,
     HELD_OUT_COURSE_SEED,
@@ -182,7 +181,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
 def evaluate(config: EvaluateConfig) -> int:
     """Fly every episode of the config; return 130 if interrupted, with the results so far."""
     require_writable(config.json, "--json")
-    console = Console(stderr=True, emoji=False)
+    console = text_console(stderr=True)
     flown_by = "" if config.json is None else identity(config)
     flown = flown_before(config, flown_by) if config.resume else {}
     failure: MavbridgeError | None = None
@@ -203,12 +202,12 @@ def evaluate(config: EvaluateConfig) -> int:
             failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
     if flown:
-        print_evaluation(config, flown, Console())
+        print_evaluation(config, flown, text_console())
     if config.json is not None and (flown or failure is None):
         write_output(config.json, to_json(config, flown, flown_by), "--json")
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
-        console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
+        console.print(f"{ended}{config.episodes} episodes", style="yellow")
     if failure is not None:
         raise failure
     return INTERRUPTED if was_stopped else 0
@@ -228,7 +227,7 @@ def _fly(
         bar = progress.add_task("flying", total=config.episodes, completed=done, status="")
         for at, episode in fly_jobs(fly_simulated, specs, config.workers, should_stop):
             for note in () if done > len(before) else episode.notes:
-                console.print(Text(note, style="yellow"))
+                console.print(note, style="yellow")
             yield indices[at], episode
             done += 1
             finished += episode.result.has_finished
@@ -354,11 +353,11 @@ def print_evaluation(
     header = ("", "mean", "95 % interval", "flights")
     console.print(make_table(", ".join(title), header, rows))
     ends = ", ".join(f"{count} {outcome}" for outcome, count in _outcomes(episodes).items())
-    console.print(Text(f"{len(episodes)} flights: {ends}"))
+    console.print(f"{len(episodes)} flights: {ends}")
     reasons = [one.lost for one in episodes if one.lost is not None]
     for code, count in Counter(reason.code for reason in reasons).most_common():
         first = next(reason for reason in reasons if reason.code is code)
-        console.print(Text(f"the policy lost control in {count}: {first}", style="yellow"))
+        console.print(f"the policy lost control in {count}: {first}", style="yellow")
 
 
 def _results(flown: Mapping[int, FlownEpisode]) -> list[EpisodeResult]:

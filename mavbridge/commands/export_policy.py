@@ -3,9 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from mavbridge.commands.config import ExportPolicyConfig
+from mavbridge.commands.output import text_console
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from policy.adapters.export import export_onnx
@@ -17,7 +16,7 @@ from policy.loading.request import PolicyRequest
 
 def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     """Write a policy, and compare the written files with it."""
-    console = Console(stderr=True, highlight=False, emoji=False)
+    console = text_console(stderr=True)
     kind = config.policy.partition(":")[0]
     if kind not in BUILTIN_KINDS:
         raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")

@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.text import Text
 
 from mavbridge.commands.config import IdentifyConfig
 from mavbridge.commands.output import make_table, table_console
@@ -319,9 +318,9 @@ def print_identification(found: Identification, contract: Contract, console: Con
     console.print(make_table("what the vehicle does", header, rows, left_columns=3))
     if found.hover_thrust is not None:
         told = f"hovers at a thrust of {found.hover_thrust:.3f}, trained with"
-        console.print(Text(f"{told} {contract.hover_thrust:.3f}"))
+        console.print(f"{told} {contract.hover_thrust:.3f}")
     for line in found.missing:
-        console.print(Text(f"not measured: {line}", style="yellow"))
+        console.print(f"not measured: {line}", style="yellow")
 
 
 def to_json(found: Identification, contract: Contract, config: IdentifyConfig) -> str:

@@ -14,7 +14,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
-from rich.text import Text
 
 from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable
@@ -56,9 +55,20 @@ def require_outputs(json: Path | None, plot: Path | None) -> None:
         require_packages("--plot", {"matplotlib": "matplotlib"})
 
 
+def text_console(*, stderr: bool = False) -> Console:
+    """Return a console that prints text as it is: a path may look like Rich's markup."""
+    return Console(stderr=stderr, highlight=False, emoji=False, markup=False)
+
+
+def print_warnings(console: Console, texts: Iterable[str]) -> None:
+    """Print a line for each text, such as a sentence about a damaged flight."""
+    for text in texts:
+        console.print(f"warning: {text}", soft_wrap=True)
+
+
 def table_console() -> Console:
-    """Return a console for standard output, as wide as the terminal or ``PIPED_WIDTH``."""
-    console = Console(highlight=False)
+    """Return a ``text_console`` as wide as the terminal or ``PIPED_WIDTH``."""
+    console = text_console()
     if not console.is_terminal:
         console.width = PIPED_WIDTH
     return console
@@ -83,7 +93,7 @@ def number(value: float | None, digits: int) -> str:
 
 def print_status(line: str) -> None:
     """Print the current activity to standard error, apart from the results."""
-    Console(stderr=True).print(Text(without_secrets(line), style="dim"), soft_wrap=True)
+    text_console(stderr=True).print(without_secrets(line), style="dim", soft_wrap=True)
 
 
 def progress_bar(console: Console, *, as_percentage: bool = False) -> Progress:

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 from rich.console import Console
-from rich.text import Text
 
 from mavbridge.commands.config import ReplayConfig, ReplayFrom
 from mavbridge.commands.output import (
@@ -308,17 +307,17 @@ def print_replay(result: ReplayResult, console: Console) -> None:
     header = ["largest difference", "equal", *names]
     console.print(make_table(title, header, rows, left_columns=2))
     recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
-    console.print(Text(recorded + (f", replayed on {result.engine}" if result.engine else "")))
+    console.print(recorded + (f", replayed on {result.engine}" if result.engine else ""))
     for gap in result.source.gaps:
-        console.print(Text(f"note: {gap}", style="yellow"))
+        console.print(f"note: {gap}", style="yellow")
     past = result.policy.inputs_differ if result.policy and result.tolerance is not None else {}
     for name in PAST_INPUTS:
         if name in past:
             note = f"{name} of {past[name]} solves are the recorded ones: built anew, they differ"
-            console.print(Text(f"note: {note}", style="yellow"))
+            console.print(f"note: {note}", style="yellow")
     for problem in result.problems:
-        console.print(Text(f"different: {problem}", style="red"))
-    console.print(Text(_verdict(result), style="bold"))
+        console.print(f"different: {problem}", style="red")
+    console.print(_verdict(result), style="bold")
 
 
 def _verdict(result: ReplayResult) -> str:

@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 from rich.console import Console
-from rich.text import Text
 from websockets.asyncio.server import Server, ServerConnection
 from websockets.asyncio.server import serve as serve_websockets
 from websockets.exceptions import ConnectionClosed
@@ -24,6 +23,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mavbridge.commands.config import ServeConfig
+from mavbridge.commands.output import text_console
 from mavbridge.core.address import is_local, spelled
 from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
@@ -185,15 +185,15 @@ def serve(config: ServeConfig) -> int:
     """Serve a policy until a signal comes."""
     policy_config = replace(config.policy, dual_rate=False)
     check_configured_policy(policy_config)
-    console, clock = Console(highlight=False), MonotonicClock()
+    console, clock = text_console(), MonotonicClock()
     with load_configured_policy(policy_config, clock) as loaded:
         for note in loaded.notes:
-            console.print(Text(note, style="yellow"))
+            console.print(note, style="yellow")
         server = PolicyServer(
             loaded.runner,
             clock=clock,
             api_key=os.environ.get(API_KEY_VARIABLE) or None,
-            report=lambda line: console.print(Text(line)),
+            report=console.print,
         )
         try:
             asyncio.run(_serve(config, server, console))
@@ -207,7 +207,7 @@ async def _serve(config: ServeConfig, server: PolicyServer, console: Console) ->
         asyncio.get_running_loop().add_signal_handler(number, server.end)
     listener = await server.listen(config.host, config.port)
     url = f"ws://{spelled(config.host, config.port)}"
-    console.print(Text(f"serving {config.policy.policy} at {url}; Ctrl-C ends it"))
+    console.print(f"serving {config.policy.policy} at {url}; Ctrl-C ends it")
     if not is_local(config.host):
         who = "every computer that reaches it"
         if os.environ.get(API_KEY_VARIABLE):
@@ -215,7 +215,7 @@ async def _serve(config: ServeConfig, server: PolicyServer, console: Console) ->
         else:
             who += f": set {API_KEY_VARIABLE} on both sides to keep strangers out"
         told = f"warning: {config.host} is open to {who}; nothing is encrypted"
-        console.print(Text(told, style="yellow"))
+        console.print(told, style="yellow")
     try:
         await asyncio.wrap_future(server.ended)
     finally:

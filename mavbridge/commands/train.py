@@ -6,11 +6,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.progress import Progress, TaskID
-from rich.text import Text
 
-from mavbridge.commands.output import progress_bar
+from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -98,7 +96,7 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
     try:
         with (
             stop_on_signals() as stop,
-            progress_bar(Console(stderr=True, highlight=False), as_percentage=True) as bar,
+            progress_bar(text_console(stderr=True), as_percentage=True) as bar,
         ):
             result = train(
                 Hooks(
@@ -108,9 +106,9 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
                 )
             )
     except TrainingStoppedError as stopped:
-        Console(stderr=True, highlight=False).print(Text(str(stopped), style="yellow"))
+        text_console(stderr=True).print(str(stopped), style="yellow")
         return INTERRUPTED
-    console = Console(highlight=False)
+    console = text_console()
     console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
     if result.validation is not None:
         console.print(result.validation.describe(), soft_wrap=True)
@@ -125,9 +123,9 @@ def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightDa
     own = [path for path in paths if path not in datasets]
     folders = find_flights(own) if own else []
     folders, note = leave_out_failed(folders, include_failed=settings.include_failed)
+    console = text_console(stderr=True)
     if note is not None:
-        Console(stderr=True, highlight=False).print(note, soft_wrap=True)
+        console.print(note, soft_wrap=True)
     flights = [read_flight(folder) for folder in folders]
-    for text in (text for flight in flights for text in flight.damage):
-        Console(stderr=True, highlight=False).print(f"warning: {text}", soft_wrap=True)
+    print_warnings(console, [text for flight in flights for text in flight.damage])
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

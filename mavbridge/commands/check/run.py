@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-from rich.console import Console
 
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
@@ -17,7 +16,7 @@ from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_
 from mavbridge.commands.check.soak import soak
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
-from mavbridge.commands.output import print_status
+from mavbridge.commands.output import print_status, text_console
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
@@ -63,7 +62,7 @@ def check(config: CheckConfig) -> int:
     document = json.dumps(as_document(rows) | {"soak": soaked}, indent=2) + "\n"
     if config.json is not None and not is_on_stdout:
         write_output(config.json, document, "--json")
-    print_check(rows, Console(stderr=is_on_stdout, highlight=False))
+    print_check(rows, text_console(stderr=is_on_stdout))
     if is_on_stdout:
         sys.stdout.write(document)
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE

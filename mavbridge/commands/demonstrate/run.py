@@ -7,13 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
 
-from rich.console import Console
-from rich.text import Text
-
 import mavbridge
 from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.output import progress_bar
+from mavbridge.commands.output import progress_bar, text_console
 from mavbridge.config.episodes import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -188,11 +185,11 @@ class _LabelledRecorder:
 
 def demonstrate(config: DemonstrateConfig) -> int:
     """Fly every episode that is not recorded yet; return 130 if interrupted, to be resumed."""
-    console = Console(stderr=True, emoji=False)
+    console = text_console(stderr=True)
     specs = _missing(config)
     done = config.episodes - len(specs)
     if done:
-        console.print(Text(f"{done} of {config.episodes} are there already", style="dim"))
+        console.print(f"{done} of {config.episodes} are there already", style="dim")
     successes = 0
     with stop_on_signals() as stop, progress_bar(console) as progress:
         bar = progress.add_task("demonstrating", total=config.episodes, completed=done, status="")
@@ -202,7 +199,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
             progress.update(bar, advance=1, status=f"{successes} of {count} finished the course")
         was_stopped = stop.is_set()
     if was_stopped:
-        console.print(Text("interrupted: run the same command to resume", style="yellow"))
+        console.print("interrupted: run the same command to resume", style="yellow")
         return INTERRUPTED
     return 0
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from mcap.writer import Writer
-from rich.console import Console
 
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.run import whole_or_nothing
+from mavbridge.commands.output import print_warnings, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind, Sticks
@@ -84,17 +84,16 @@ def _numbers(*names: str) -> JsonObject:
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
     """Export each flight to a file named after its folder."""
-    console = Console(stderr=True, highlight=False, emoji=False)
+    console = text_console(stderr=True)
     folders = find_flights(flights)
     above, count = Path(os.path.commonpath([folder.parent for folder in folders])), 0
     with whole_or_nothing(config.out) as out:
         for folder in folders:
             flight, name = open_flight(folder), "-".join(folder.relative_to(above).parts)
-            for text in flight.damage:
-                console.print(f"warning: {text}", soft_wrap=True)
+            print_warnings(console, flight.damage)
             count += write_flight(flight, out / f"{name}.mcap")
     text = f"{config.out}: {len(folders)} flights, {count} messages"
-    Console(highlight=False).print(text, soft_wrap=True)
+    text_console().print(text, soft_wrap=True)
     return 0
 
 

@@ -16,11 +16,10 @@ from shutil import rmtree
 import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
-from rich.console import Console
 
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
-from mavbridge.commands.output import progress_bar
+from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
@@ -145,7 +144,7 @@ def worst_shift_ns(part: Stretch, fps: int) -> int:
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
     """Export flights."""
-    console = Console(stderr=True, highlight=False, emoji=False)
+    console = text_console(stderr=True)
     folders = find_flights(flights)
     exemplary, note = leave_out_failed(folders, include_failed=config.include_failed)
     if note is not None:
@@ -155,14 +154,13 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         episodes = []
         for flight in exemplary:
             episodes.append(read_flight(flight))
-            for text in episodes[-1].damage:
-                console.print(f"warning: {text}", soft_wrap=True)
+            print_warnings(console, episodes[-1].damage)
             progress.advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames, status="")
         summary = write_dataset(episodes, folder, config, lambda: progress.advance(writing))
         write_contract(folder, exemplary, config)
-    Console(highlight=False).print(f"{config.out}: {summary}", soft_wrap=True)
+    text_console().print(f"{config.out}: {summary}", soft_wrap=True)
     return 0
 
 

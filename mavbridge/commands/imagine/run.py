@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.text import Text
 
 import policy
 from mavbridge.commands.config import ImagineConfig
@@ -26,7 +25,7 @@ from mavbridge.commands.imagine.loop import (
     torch_threads,
 )
 from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame, prepare_out
-from mavbridge.commands.output import progress_bar
+from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
@@ -50,7 +49,7 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 def imagine(config: ImagineConfig) -> int:
     """Imagine a flight; if interrupted, return 130 and keep the output so far."""
-    console = Console(stderr=True, highlight=False, emoji=False)
+    console = text_console(stderr=True)
     clock = MonotonicClock()
     plan = RolloutPlan(
         iterations=config.n_iter,
@@ -60,8 +59,7 @@ def imagine(config: ImagineConfig) -> int:
     )
     prepare_out(config.out)
     flight = open_flight(config.start)
-    for text in flight.damage:
-        console.print(f"warning: {text}", soft_wrap=True)
+    print_warnings(console, flight.damage)
     model = load_model(
         config.world_model, ddim_steps=config.ddim_steps, device=config.policy.device
     )
@@ -92,7 +90,7 @@ def imagine(config: ImagineConfig) -> int:
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
     _print_summary(config, sampler, output)
     if was_stopped:
-        console.print(Text("interrupted: the files hold what was imagined so far", style="yellow"))
+        console.print("interrupted: the files hold what was imagined so far", style="yellow")
     return INTERRUPTED if was_stopped else 0
 
 
@@ -166,12 +164,12 @@ def _make_decider(
     wanted = replace(config.policy, dual_rate=True)
     loaded = stack.enter_context(load_configured_policy(wanted, clock))
     for note in loaded.notes:
-        console.print(Text(note, style="yellow" if isinstance(note, Warned) else "dim"))
+        console.print(note, style="yellow" if isinstance(note, Warned) else "dim")
     return PolicyDecider(loaded.runner, sampler)
 
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
-    console = Console(highlight=False)
+    console = text_console()
     seconds = sampler.seconds
     decoded = sampler.frames_decoded + output.frames_decoded
     what = f"{config.out}: {output.frames} frames"

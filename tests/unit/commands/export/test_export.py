@@ -173,11 +173,11 @@ def test_the_command_exports_what_train_can_read(tmp_path: Path) -> None:
     for k in range(2):
         fly(tmp_path / "flights" / str(k), number=k)
     fly(tmp_path / "flights" / "failed", success=False)
-    out = tmp_path / "dataset"
+    out = tmp_path / "data[set]"
     status, text = told_by("export", tmp_path / "flights", "--out", out, "--task", "race")
-    assert (status, "1 of 3 flights" in text) == (0, True)
+    assert (status, "1 of 3 flights" in text, f"{out}: 2 episodes" in text) == (0, True, True)
     assert broken_rules(out) == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["dataset", "flights"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data[set]", "flights"]
     assert [len(episode.captured_ns) for episode in read_dataset(out)] == [30, 30]
     small = ("--policy", "toge:small:resnet8", "--image-size", "32", "--steps", "1")
     status, text = told_by("train", out, "--out", tmp_path / "a.safetensors", *small)
