@@ -274,7 +274,7 @@ class FlyConfig(Ranged):
             north, east, down = (float(text) for text in self.goal.split(","))
         except ValueError:
             north = east = down = math.nan
-        if not max(abs(north), abs(east), abs(down)) < MAX_GOAL_M:  # also true of NaN
+        if not all(abs(metres) < MAX_GOAL_M for metres in (north, east, down)):  # also of NaN
             raise UserError(
                 f"--goal {self.goal} is not understood: use NORTH,EAST,DOWN in metres, such as "
                 "20,0,-5 for 20 m north and 5 m up"
