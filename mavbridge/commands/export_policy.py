@@ -29,8 +29,13 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
         raise UserError(
             f"{config.policy} flies by {policy.contract.action}: policies by sticks are exported"
         )
-    config.out.mkdir(parents=True, exist_ok=True)
-    export_onnx(policy, config.out)
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+        export_onnx(policy, config.out)
+    except OSError as error:
+        raise UserError(
+            f"--out {config.out} cannot be written: {error.strerror or error}"
+        ) from error
     spec = f"onnx:{config.out}"
     reason = _difference(ours, PolicyRequest(spec=spec))
     if reason is not None:

@@ -60,6 +60,7 @@ BAD = [
     ("export-policy --out new --policy scripted", "toge and resnet-unet are exported"),
     ("export-policy --out new --policy resnet-unet", "needs trained weights"),
     ("export-policy --out taken.mp4", "is taken"),
+    ("export-policy --out taken.mp4/onnx", "--out taken.mp4/onnx cannot be written"),
     ("identify --connect udp:127.0.0.1:1 --readonly", "--readonly"),
     (f"{START} --exe-steps 5 --frames 4", "--exe-steps 5 is more than --frames 4"),
     (f"{START} --frames 17", "--frames 17 is more than the 16"),
