@@ -26,6 +26,7 @@ from mavbridge.commands.imagine.loop import (
 )
 from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
@@ -155,11 +156,13 @@ def _make_decider(
     config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console, stack: ExitStack
 ) -> Decider:
     if config.decider == "world-model":
-        if config.policy.checkpoint is not None:
-            raise UserError(
-                f"--checkpoint {config.policy.checkpoint} is of a policy, and the world model "
-                "decides: add --decider toge, or leave it out"
-            )
+        named = {"checkpoint": config.policy.checkpoint, "policy": config.policy.policy}
+        for flag, value in named.items():
+            if value != getattr(PolicyConfig, flag):
+                raise UserError(
+                    f"--{flag} {value} is of a policy, and the world model decides: add "
+                    "--decider toge, or leave it out"
+                )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
     wanted = replace(config.policy, dual_rate=True)
     loaded = stack.enter_context(load_configured_policy(wanted, clock))

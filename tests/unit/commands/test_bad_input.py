@@ -69,6 +69,7 @@ BAD = [
     (f"{START} --start-at 5", "too short"),
     (f"{START} --decider toge --policy toge:medium", "--checkpoint"),
     (f"{START} --checkpoint a.safetensors", "add --decider toge"),
+    (f"{START} --policy onnx:a", "--policy onnx:a is of a policy"),
     (f"{START} --decider pilot", "pilot"),
     (f"{START} --device cuda:9", "cuda:9 is not available"),
     (f"{START} --rerun a.txt", ".rrd"),
