@@ -87,7 +87,10 @@ cli = App(
     name="mavbridge",
     help=HELP,
     version=mavbridge.__version__,
-    default_parameter=Parameter(show_default=_shown_default, converter=_exactly),
+    # A word such as [a] is a name, not a list in JSON.
+    default_parameter=Parameter(
+        show_default=_shown_default, converter=_exactly, json_list=False, json_dict=False
+    ),
     error_formatter=_as_ours,
 )
 cli.register_install_completion_command(help="Install completion for this shell (bash, zsh, fish).")

@@ -88,6 +88,7 @@ BAD = [
     ("inspect flight --json /dev/full", "cannot write --json /dev/full"),
     ("inspect flight --html /dev/full", "cannot write --html /dev/full"),
     ("inspect nowhere --rerun nonsense", "--rerun"),
+    ("inspect [a]", "no folder [a]"),
     (RECORD, "name the vehicle: --connect"),
     (f"{RECORD} --connect udp:nowhere", "udp:nowhere"),
     (f"{LISTEN} --camera none", "nothing to learn from without images"),
