@@ -143,6 +143,20 @@ class FlightAnalysis:
         return self.cameras[0]
 
     @property
+    def times_ms(self) -> tuple[tuple[str, Percentiles | None], ...]:
+        """Measured times by name; None: not measured."""
+        report = self.report
+        return (
+            ("stick lateness", report.sticks.lateness_ms),
+            ("chunk period", report.action.period_ms),
+            ("predict", report.action.predict_ms),
+            ("feature age at send", report.feature_age_ms),
+            ("attitude age at send", report.state_age_ms),
+            ("new attitude to wire", report.state_to_wire_ms),
+            ("exposure to feature", self.images.latency_ms),
+        )
+
+    @property
     def causes(self) -> tuple[tuple[str, int], ...]:
         """Number of late chunks and missed slots by cause, the most frequent first."""
         counts: dict[str, int] = {}

@@ -213,31 +213,6 @@ class Plot {
   }
 }
 
-function drawHistogram(canvas, histogram) {
-  const height = 110;
-  const [c, width] = context(canvas, height);
-  const box = { left: MARGIN.left, right: width - MARGIN.right, top: MARGIN.top, bottom: height - MARGIN.bottom };
-  const { edges, counts } = histogram;
-  const x = scaleOf(edges[0], edges[edges.length - 1], box.left, box.right);
-  const y = scaleOf(0, Math.log10(Math.max(10, ...counts)) + 0.1, box.bottom, box.top);
-  c.fillStyle = color(0);
-  counts.forEach((count, k) => {
-    if (!count) return;
-    const top = y.at(Math.log10(count) + 0.1);
-    c.fillRect(x.at(edges[k]) + 0.5, top, Math.max(x.at(edges[k + 1]) - x.at(edges[k]) - 1, 1), box.bottom - top);
-  });
-  c.fillStyle = css("--muted"); c.textAlign = "right"; c.textBaseline = "middle";
-  for (let power = 0; 10 ** power <= Math.max(10, ...counts); power++) {
-    c.fillText(String(10 ** power), box.left - 5, y.at(power + 0.1));
-  }
-  c.textBaseline = "alphabetic"; c.textAlign = "center";
-  const ticks = steps(edges[0], edges[edges.length - 1], Math.max(2, width / 70));
-  for (const value of ticks) {
-    const isLast = value === ticks[ticks.length - 1] && value >= edges[edges.length - 1];
-    c.fillText(isLast ? `≥${shown(value)}` : shown(value), Math.min(x.at(value), box.right - 12), height - 5);
-  }
-}
-
 class Bands {
   constructor(parent, flight, timeline) {
     Object.assign(this, { flight, timeline });
@@ -414,13 +389,6 @@ function addFlight(parent, flight) {
   if (flight.video) addVideo(section, flight.video, timeline);
   const t = floats(flight.t);
   for (const plot of flight.plots) new Plot(section, plot, t, timeline);
-  const pair = add(section, "div", undefined, "pair");
-  for (const histogram of flight.histograms) {
-    const side = add(pair, "div");
-    add(side, "h2", `${histogram.title} [${histogram.unit}], how often`);
-    const canvas = add(add(side, "div"), "canvas");
-    timeline.listeners.push(() => drawHistogram(canvas, histogram));
-  }
   timeline.tell();
   return timeline;
 }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis
-from mavbridge.commands.inspect.series import FloatColumn, TickSeries
+from mavbridge.commands.inspect.series import FloatColumn
 from mavbridge.commands.output import number
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.files import write_output
@@ -21,7 +21,6 @@ from mavbridge.observe.viewer.layout import action_title
 
 MAX_VIDEO_BYTES = 40_000_000
 """A larger video stays beside the page: larger data URLs make browsers slow."""
-BINS = 40
 ECHO = "vehicle's echo"
 ECHO_WIDTH, LINE_WIDTH = 5.0, 1.4
 """In pixels. The echo is drawn under the sticks, and is visible on both sides if they agree."""
@@ -58,7 +57,6 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
         "end_s": float(series.t_s[-1]) if len(series.t_s) else 0.0,
         "t": _packed(series.t_s),
         "plots": [plot for plot in _plots(flight) if plot["series"]],
-        "histograms": list(_histograms(series)),
         "holders": [asdict(span) | {"reason": str(span.reason or "")} for span in flight.holders],
         "moments": [asdict(moment) for moment in flight.moments],
         "track": _track(flight),
@@ -101,12 +99,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     for name, loop, rest in (("chunks", action, late), ("images", vision, shown)):
         is_slow = loop.rate_hz is not None and loop.rate_hz < 0.9 * loop.target_hz
         yield name, f"{number(loop.rate_hz, 1)} of {loop.target_hz:.4g} Hz, {rest}", is_slow
-    for name, measured in (
-        ("stick lateness", sticks.lateness_ms),
-        ("feature age", report.feature_age_ms),
-        ("attitude to wire", report.state_to_wire_ms),
-        ("exposure to feature", flight.images.latency_ms),
-    ):
+    for name, measured in flight.times_ms:
         if measured is not None:
             p50, p99 = f"p50 {measured.p50:.2f}", f"p99 {measured.p99:.2f}"
             yield name, f"{p50}, {p99}, most {measured.max:.2f} ms", False
@@ -174,26 +167,6 @@ def _plot(
 def _packed(values: FloatColumn) -> str:
     """Encode as little-endian float32 in base64, which a script reads without rounding."""
     return b64encode(values.astype("<f4").tobytes()).decode()
-
-
-def _histograms(series: TickSeries) -> Iterator[dict[str, Any]]:
-    for title, values_ms in (
-        ("Stick lateness", series.lateness_ms),
-        ("Age of the feature", series.feature_age_ms),
-        ("Age of the attitude", series.state_age_ms),
-    ):
-        known = values_ms[np.isfinite(values_ms)]
-        if not len(known):
-            continue
-        # Range: 1.5 times the 99.5th percentile. The last bin takes all larger values.
-        edges = np.linspace(0, max(1.0, 1.5 * float(np.percentile(known, 99.5))), BINS + 1)
-        counts, _ = np.histogram(np.minimum(known, edges[-1]), bins=edges)
-        yield {
-            "title": title,
-            "unit": "ms",
-            "edges": [round(float(edge), 4) for edge in edges],
-            "counts": [int(count) for count in counts],
-        }
 
 
 def _track(flight: FlightAnalysis) -> dict[str, str] | None:

@@ -217,15 +217,7 @@ def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
     yield Figure("late chunks", "", action.late_chunks, 0)
     yield Figure("sends coasting", "", sticks.coasting_sends, 0)
     yield Figure("releases", "", report.release_count, 0)
-    for name, measured in (
-        ("stick lateness", sticks.lateness_ms),
-        ("chunk period", action.period_ms),
-        ("predict", action.predict_ms),
-        ("feature age at send", report.feature_age_ms),
-        ("attitude age at send", report.state_age_ms),
-        ("new attitude to wire", report.state_to_wire_ms),
-        ("exposure to feature", flight.images.latency_ms),
-    ):
+    for name, measured in flight.times_ms:
         yield Figure(f"{name}, p50", "ms", None if measured is None else measured.p50, 2)
         yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
     path_m = flight.track.length_m if flight.track else 0.0
