@@ -22,7 +22,7 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput, ignore_frame
+from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
@@ -128,7 +128,7 @@ def run(
     decider: str = "world-model",
     decode_video: bool = True,
     model: TinyWorld | None = None,
-    on_frame: OnFrame = ignore_frame,
+    on_frame: OnFrame | None = None,
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model)

@@ -52,10 +52,6 @@ OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
 """Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""
 
 
-def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
-    """An ``OnFrame`` that does nothing."""
-
-
 def prepare_out(out: Path) -> None:
     """Check that a rollout can be written here.
 
@@ -108,7 +104,7 @@ class StreamedOutput:
         plan: RolloutPlan,
         *,
         decode_video: bool = True,
-        on_frame: OnFrame = ignore_frame,
+        on_frame: OnFrame | None = None,
     ) -> None:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
@@ -147,11 +143,6 @@ class StreamedOutput:
     def decode_queue(self) -> int:
         """Number of segments waiting to be decoded."""
         return self._jobs.qsize()
-
-    @property
-    def writer_queue(self) -> int:
-        """Number of frames waiting to be written."""
-        return 0 if self.video is None else self.video.lost
 
     def put(self, segment: Segment) -> None:
         """Queue a segment; wait while the queue is full."""
@@ -259,7 +250,8 @@ class StreamedOutput:
                 )
                 self.video.submit(rgb, row)
                 self._digest.update(np.ascontiguousarray(rgb).data)
-            self._on_frame(frame, rgb)
+            if self._on_frame is not None:
+                self._on_frame(frame, rgb)
             self.frames += 1
 
     def _decoded(

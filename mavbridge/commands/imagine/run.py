@@ -24,7 +24,7 @@ from mavbridge.commands.imagine.loop import (
     rollout,
     torch_threads,
 )
-from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame, prepare_out
+from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
@@ -43,8 +43,6 @@ from policy.preprocess import resize
 
 MAX_STATE_AGE_NS = 100_000_000
 """Oldest state, at the exposure of a frame, that still belongs to it."""
-MAX_HISTORY_S = 10.0
-"""Longest history that any policy uses."""
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
@@ -78,7 +76,7 @@ def imagine(config: ImagineConfig) -> int:
     with ExitStack() as stack:
         decider = _make_decider(config, sampler, clock, console, stack)
         stack.enter_context(torch_threads(free))
-        on_frame: OnFrame = ignore_frame
+        on_frame: OnFrame | None = None
         if config.rerun != "off":
             from mavbridge.observe.viewer.rollout import RolloutView
 
@@ -114,10 +112,7 @@ def run_rollout(
             task = bar.add_task("imagining", total=plan.iterations * plan.frames, status="")
 
             def refresh() -> None:
-                status = (
-                    f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}, "
-                    f"to write {output.writer_queue}"
-                )
+                status = f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}"
                 bar.update(task, completed=output.frames, status=status)
 
             for segment in rollout(sampler, decider, start, plan):
@@ -253,12 +248,11 @@ def _require_state_frame(flight: RecordedFlight, config: WorldModelConfig) -> No
 
 
 def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks | None], ...]:
-    since_ns = now_ns - round(MAX_HISTORY_S * NS_PER_S)
     columns = (flight.ticks["sent_ns"].to_pylist(), flight.ticks["sent"].to_pylist())
     return tuple(
         (sent_ns, None if sent is None else Sticks(*sent))
         for sent_ns, sent in zip(*columns, strict=True)
-        if since_ns <= sent_ns < now_ns
+        if sent_ns < now_ns
     )
 
 
