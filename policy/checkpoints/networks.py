@@ -35,7 +35,6 @@ from policy.checkpoints.tensors import (
     read_tensors,
     require_finite,
     require_fit,
-    shapes_of,
     unpack,
     write_tensors,
 )
@@ -91,13 +90,11 @@ def save_checkpoint(
     write_tensors(path, state, header)
 
 
-def load_checkpoint_with_notes(
-    path: Path, *, fallback: BuiltinConfig
-) -> tuple[BuiltinPolicy, tuple[str, ...]]:
+def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     """Read a checkpoint into its network, on the CPU, in eval mode.
 
     ``fallback`` is the requested policy: the file must be of its kind, and its values supply
-    everything that a ``.pt`` lacks. The notes say where the weights were found in a ``.pt``.
+    everything that a ``.pt`` lacks.
     """
     require_file(path, SUFFIXES)
     is_ours = path.suffix == ".safetensors"
@@ -105,12 +102,7 @@ def load_checkpoint_with_notes(
         header, tensors = read_tensors(path)
         require_header(path, header)
     else:
-        header, tensors = {}, read_torch(path)
-        if "contract" in tensors:
-            raise CheckpointError(
-                f"{path}: holds a contract, which is not read from a torch file: save it as "
-                ".safetensors, or the weights alone"
-            )
+        header, tensors = {}, _read_torch(path)
     try:
         policy = build_policy(_config_of(header, type(fallback)) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
@@ -118,15 +110,11 @@ def load_checkpoint_with_notes(
         raise CheckpointError(f"{path}: {told}") from error
     vector = {
         name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
-        for name in (list(tensors) if is_ours else ())
+        for name in list(tensors)
         if name.startswith(VECTOR_PREFIX)
     }
     require_finite(path, vector)
-    note: str | None = None
-    if is_ours:
-        state = unpack(tensors)
-    else:
-        state, note = find_weights(path, tensors, shapes_of(policy))
+    state = unpack(tensors)
     require_finite(path, state)
     require_fit(
         *(path, policy, state),
@@ -136,12 +124,7 @@ def load_checkpoint_with_notes(
     policy.eval()
     if vector:
         _require_reproduced(path, policy, vector)
-    return policy, () if note is None else (note,)
-
-
-def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
-    """Read a checkpoint as ``load_checkpoint_with_notes`` does, without the notes."""
-    return load_checkpoint_with_notes(path, fallback=fallback)[0]
+    return policy
 
 
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
@@ -193,8 +176,8 @@ def _config_of(header: dict[str, str], wanted: type[BuiltinConfig]) -> BuiltinCo
         ) from error
 
 
-def read_torch(path: Path) -> dict[Any, Any]:
-    """Read a dictionary of weights saved by torch; executes no pickle."""
+def _read_torch(path: Path) -> dict[str, Tensor]:
+    """Read weights saved by torch; executes no pickle."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about file formats; serious faults are rejected below
@@ -215,7 +198,12 @@ def read_torch(path: Path) -> dict[Any, Any]:
             f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "
             "save model.state_dict()"
         )
-    return loaded
+    if "contract" in loaded:
+        raise CheckpointError(
+            f"{path}: holds a contract, which is not read from a torch file: save it as "
+            ".safetensors, or the weights alone"
+        )
+    return find_weights(path, loaded)
 
 
 def save_world_model(path: Path, model: WorldModel, *, training: str | None = None) -> None:

@@ -1,10 +1,6 @@
-"""Reading, writing and checking of weight files of any network; faults are ``CheckpointError``.
+"""Reading, writing and checking of weight files of any network; faults are ``CheckpointError``."""
 
-A file of ``torch.load`` may hold the weights bare or wrapped; ``find_weights`` finds them.
-"""
-
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +8,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
 from policy.errors import CheckpointError
 from policy.files import open_safetensors, whole_file
@@ -19,12 +16,8 @@ from policy.files import open_safetensors, whole_file
 SCALE = ".int8_scale"
 """Suffix of a weight's name for its scales, one per output channel."""
 _LARGEST = 127.0
-USUAL_KEYS = ("model_state_dict", "state_dict", "model", "policy", "net")
-ANCHORS = 8
-"""Number of weight names, from all parts of the network, to search for behind a prefix."""
-_AVERAGED = re.compile(r"(^|[._])(ema|averaged|average|swa|shadow)([._]|$)")
-Shapes = Mapping[str, tuple[int, ...]]
-"""Shape of each weight by name."""
+USUAL_KEYS = ("state_dict", "model_state_dict")
+"""Keys of the weights in a file of ``torch.save``."""
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
@@ -55,14 +48,17 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
         )
 
 
-def shapes_of(network: nn.Module) -> Shapes:
-    """Return the shape of each weight of a network."""
-    return {name: tuple(value.shape) for name, value in network.state_dict().items()}
-
-
 def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advice: str) -> None:
     """Raise CheckpointError with the first misfits and the next step; torch would list hundreds."""
-    if problems := misfits(state, shapes_of(policy)):
+    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
+    problems = [f"missing {name!r}" for name in wanted if name not in state]
+    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
+    problems += [
+        f"{name!r} is {list(state[name].shape)}, must be {shape}"
+        for name, shape in wanted.items()
+        if name in state and list(state[name].shape) != shape
+    ]
+    if problems:
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "
             f"{'; '.join(problems[:4])}. {advice}"
@@ -102,85 +98,21 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return state
 
 
-def find_weights(
-    path: Path, loaded: Mapping[Any, Any], wanted: Shapes
-) -> tuple[dict[str, Tensor], str | None]:
-    """Return the weights in a file that fit a network, or else the closest candidate.
-
-    They may be under keys (``state_dict``, ``ema``) and behind prefixes (``module.``, ``net.``).
-    Averaged weights are preferred to the weights behind the average. The second value is a line for
-    the user if there was a choice or a prefix.
-    """
-    found = [
-        (f"{key}.{prefix}".strip("."), state)
-        for key, table in _tables(loaded)
-        for prefix, state in _behind_prefixes(table, wanted)
-    ]
-    if not found or "param_groups" in loaded:
-        raise CheckpointError(
-            f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a "
-            f"state dict itself, and holds {sorted(map(str, loaded))[:8]}"
-        )
-    fitting = [each for each in found if not misfits(each[1], wanted)]
-    if not fitting:
-        return min((state for _, state in found), key=lambda each: len(misfits(each, wanted))), None
-    averaged = [each for each in fitting if _AVERAGED.search(each[0])]
-    where, state = (averaged or fitting)[0]
-    if averaged:
-        plain = next((name for name, _ in fitting if not _AVERAGED.search(name)), None)
-        besides = f", not those under {plain!r}" if plain is not None else ""
-        return state, f"the averaged weights under {where!r} fly{besides}"
-    return state, None if where in ("", *USUAL_KEYS[:2]) else f"weights under {where!r}"
-
-
-def misfits(state: Mapping[str, Tensor], wanted: Shapes) -> list[str]:
-    """Return a phrase for each weight that prevents loading a state dict."""
-    problems = [f"missing {name!r}" for name in wanted if name not in state]
-    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
-    problems += [
-        f"{name!r} is {list(state[name].shape)}, must be {list(shape)}"
-        for name, shape in wanted.items()
-        if name in state and tuple(state[name].shape) != shape
-    ]
-    return problems
-
-
-def _tables(loaded: Mapping[Any, Any]) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Yield every dictionary of tensors, up to two levels deep, with its key; usual keys first."""
-    first = [key for key in USUAL_KEYS if key in loaded]
-    for key in (*first, *(key for key in loaded if key not in first)):
-        value = loaded[key]
-        if not isinstance(value, Mapping) or key in ("optimizer", "optimizer_state_dict"):
-            continue
-        for inner, table in (("", value), *value.items()):
-            if isinstance(table, Mapping) and (tensors := _tensors(table)):
-                yield f"{key}.{inner}".strip("."), tensors
-    if tensors := _tensors(loaded):
-        yield "", tensors
-
-
-def _tensors(value: Mapping[Any, Any]) -> dict[str, Tensor]:
-    return {
-        name: each
-        for name, each in value.items()
-        if isinstance(name, str) and isinstance(each, Tensor)
-    }
-
-
-def _behind_prefixes(
-    table: dict[str, Tensor], wanted: Shapes
-) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Yield the table, and its entries behind each prefix of a wanted name, prefix removed."""
-    yield "", table
-    anchors = list(wanted)[:: max(1, len(wanted) // ANCHORS)]
-    prefixes = {
-        name.removesuffix(anchor): None
-        for name in table
-        for anchor in anchors
-        if name.endswith("." + anchor)
-    }
-    for prefix in prefixes:
-        yield (
-            prefix,
-            {n.removeprefix(prefix): value for n, value in table.items() if n.startswith(prefix)},
-        )
+def find_weights(path: Path, loaded: Mapping[Any, Any]) -> dict[str, Tensor]:
+    """Return the weights of a torch file: it is a state dict, or holds one under a usual key."""
+    found = next((loaded[key] for key in USUAL_KEYS if key in loaded), loaded)
+    if isinstance(found, Mapping):
+        weights = {
+            name: value
+            for name, value in found.items()
+            if isinstance(name, str) and isinstance(value, Tensor)
+        }
+        # Of data-parallel and compiled networks.
+        for prefix in ("module.", "_orig_mod."):
+            consume_prefix_in_state_dict_if_present(weights, prefix)
+        if weights:
+            return weights
+    raise CheckpointError(
+        f"{path}: no weights found; it holds {sorted(map(str, loaded))[:8]}, and must be a state "
+        f"dict, or hold one as {' or '.join(map(repr, USUAL_KEYS))}: save model.state_dict()"
+    )

@@ -88,16 +88,16 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
 def _trained(
     config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
 ) -> tuple["BuiltinPolicy", list[str]]:
-    from policy.checkpoints.networks import load_checkpoint_with_notes
+    from policy.checkpoints.networks import load_checkpoint
 
-    policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
+    policy = load_checkpoint(checkpoint, fallback=config)
     parts = (policy.config.size, policy.config.backbone)
     if contradicted := [option for option in options if option not in parts]:
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
     policy.head.seed_noise(seed)
-    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}", *found]
+    notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
