@@ -361,7 +361,7 @@ class Contract:
     @classmethod
     def from_json(cls, text: str) -> "Contract":
         """Read the header form; fields that an older version lacks get their defaults."""
-        data = parse_object(text, ContractError, "the contract in the checkpoint")
+        data = parse_object(text, ContractError, "the contract")
         version = data.pop("version", CONTRACT_VERSION)
         if not isinstance(version, int) or not OLDEST_VERSION <= version <= CONTRACT_VERSION:
             raise ContractError(

@@ -1,10 +1,10 @@
 """Reads the project's flight folders (docs/formats.md)."""
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -21,7 +21,8 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.flight_video import decode_images, video_parts, with_images
-from policy.data.tables import parse_state_frame, read_rows, stamps, vectors
+from policy.data.tables import read_rows, stamps, vectors
+from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
 
@@ -113,9 +114,8 @@ def read_flight(folder: Path) -> FlightData:
     the same stick means something else.
     """
     name, meta = str(folder), _read_meta(folder)
-    contract = _contract(meta)
-    state_frame = parse_state_frame(name, contract.get("state_frame"))
-    terms = _terms(name, contract)
+    contract = _contract(name, meta)
+    _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
     damage: list[str] = []
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
@@ -132,17 +132,17 @@ def read_flight(folder: Path) -> FlightData:
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
-    sent, target, is_target = _sticks(name, meta, ticks, terms)
+    sent, target, is_target = _sticks(name, meta, ticks, contract)
     # The expert observed at the policy's tick; its stick is for that time.
     target_ns = tick_ns if "expert" in ticks.column_names else sent_ns
-    if terms.action == "rates":
+    if contract.action == "rates":
         is_target &= _known(state)
-        loop = StickLoop(rates_contract(Contract(hover_thrust=terms.hover_thrust)))
+        loop = StickLoop(rates_contract(contract))
         target[is_target] = loop.to_sticks(target[is_target], state[is_target])
     state[~is_target] = np.nan
     return FlightData(
         name=name,
-        state_frame=state_frame,
+        state_frame=contract.state_frame,
         tick_ns=tick_ns,
         state=state,
         attitude_ns=_stamps_or(ticks, "attitude_ns", tick_ns, _known(state)),
@@ -151,7 +151,9 @@ def read_flight(folder: Path) -> FlightData:
         target=target[is_target],
         sent_ns=sent_ns,
         sent=np.nan_to_num(sent, nan=0.0),
-        terms=terms,
+        terms=ActionTerms(
+            contract.action, contract.hover_thrust, contract.max_tilt_deg, contract.stops_at_end
+        ),
         course_seed=course_seed if isinstance(course_seed, int) else None,
         age_ns=_ages(ticks),
         captured_ns=stamps(name, frames, "captured_ns"),
@@ -162,16 +164,15 @@ def read_flight(folder: Path) -> FlightData:
 
 
 def _sticks(
-    name: str, meta: Mapping[str, object], ticks: pa.Table, terms: ActionTerms
+    name: str, meta: Mapping[str, object], ticks: pa.Table, contract: Contract
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
-    sent, modes = _sent(name, ticks, terms), _contract(meta).get("modes")
-    modes = modes if isinstance(modes, list) else Contract().modes
+    sent = _sent(name, ticks, contract)
     is_expert = "expert" in ticks.column_names
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
-    is_in_mode = np.isin(ticks["mode"].to_pylist(), modes)
-    is_correction = is_in_mode & _corrections(meta, ticks)
+    is_in_mode = np.isin(ticks["mode"].to_pylist(), contract.modes)
+    is_correction = is_in_mode & _corrections(meta, ticks, contract)
     if not is_expert and is_correction.any():
         sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
         target, is_target = sent, is_correction
@@ -181,14 +182,14 @@ def _sticks(
     if not is_target.any():
         raise DatasetError(
             f"{name}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks "
-            f"of a pilot while armed and in {' or '.join(map(str, modes))}"
+            f"of a pilot while armed and in {' or '.join(contract.modes)}"
         )
     return sent, target, is_target
 
 
-def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
+def _sent(name: str, ticks: pa.Table, contract: Contract) -> FloatArray:
     """Return the sent sticks, or the pilot's if none were sent; centred in a flight by rates."""
-    if terms.action == "sticks":
+    if contract.action == "sticks":
         sent = vectors(name, ticks, "sent", ACTION_DIM)
         return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks", ACTION_DIM)
     if "expert" not in ticks.column_names:
@@ -199,11 +200,13 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
     return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
 
 
-def _corrections(meta: Mapping[str, object], ticks: pa.Table) -> NDArray[np.bool_]:
+def _corrections(
+    meta: Mapping[str, object], ticks: pa.Table, contract: Contract
+) -> NDArray[np.bool_]:
     """Return the ticks in which a pilot flew on after taking over from the policy by the sticks."""
-    contract, outcome = _contract(meta), meta.get("outcome")
+    outcome = meta.get("outcome")
     is_takeover = isinstance(outcome, dict) and outcome.get("end") == "takeover"
-    if not is_takeover or contract.get("action", "sticks") != "sticks":
+    if not is_takeover or contract.action != "sticks":
         return np.zeros(ticks.num_rows, bool)
     names = ("phase", "armed", "sent", "rc_sticks")
     rows = zip(*(ticks[name].to_pylist() for name in names), strict=True)
@@ -218,7 +221,7 @@ def _corrections(meta: Mapping[str, object], ticks: pa.Table) -> NDArray[np.bool
 
 def read_ages(folder: Path) -> Nanoseconds:
     """Return the sorted image ages that were measured at the ticks of a flight."""
-    parse_state_frame(str(folder), _contract(_read_meta(folder)).get("state_frame"))
+    _read_meta(folder)
     ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
@@ -252,31 +255,26 @@ def _read_meta(folder: Path) -> dict[str, object]:
     return data
 
 
-def _contract(meta: Mapping[str, object]) -> dict[str, Any]:
-    """Return the fields of a flight's contract; the first flights had none."""
-    contract = meta.get("contract")
-    return contract if isinstance(contract, dict) else {}
+def _contract(name: str, meta: Mapping[str, object]) -> Contract:
+    """Return the contract that a flight was flown by."""
+    try:
+        return Contract.from_json(json.dumps(meta.get("contract")))
+    except ContractError as error:
+        raise DatasetError(f"{name}: {error}") from error
 
 
-def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
-    """Return the action terms of a flight's contract; the first flights were flown by sticks."""
-    action = contract.get("action", "sticks")
-    if action not in ("sticks", "rates"):
+def _require_learnable(name: str, contract: Contract) -> None:
+    """Raise DatasetError for actions that no network of ours learns."""
+    if contract.action not in ("sticks", "rates"):
         raise DatasetError(
-            f"{name} was flown by {action}: this build learns from sticks and body rates"
+            f"{name} was flown by {contract.action}: this build learns from sticks and body rates"
         )
-    if action == "rates" and contract.get("state_frame") != "ned_frd":
+    if contract.action == "rates" and contract.state_frame != "ned_frd":
         # Recorded actions are in NED and FRD axes in any state frame; sticks have no axes.
         raise DatasetError(
-            f"{name} was flown by rates with its state in {contract.get('state_frame')}: this "
-            "build learns body rates in ned_frd alone"
+            f"{name} was flown by rates with its state in {contract.state_frame}: this build "
+            "learns body rates in ned_frd alone"
         )
-    hover, tilt = contract.get("hover_thrust", 0.39), contract.get("max_tilt_deg")
-    for number in (hover, 1.0 if tilt is None else tilt):
-        if not isinstance(number, int | float) or isinstance(number, bool) or not number > 0:
-            raise DatasetError(f"{name}: {number!r} in its contract is no number above 0")
-    stops = contract.get("stops_at_end") is True
-    return ActionTerms(action, float(hover), None if tilt is None else float(tilt), stops)
 
 
 def _read_table(

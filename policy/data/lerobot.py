@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import av
 import cv2
@@ -27,7 +27,7 @@ from policy.contract import (
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
-from policy.data.tables import numbers, parse_state_frame, stamps, vectors
+from policy.data.tables import numbers, stamps, vectors
 from policy.files import library_name, read_object, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
@@ -263,9 +263,13 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
     """Return the frame in ``info``, else by gravity: in level flight -z is up in FRD, +z in FLU."""
     about = info.features[names.STATE_KEY].get("info")
-    frame = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
-    if frame is not None:
-        return parse_state_frame(row.name, frame)
+    noted = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
+    if noted in get_args(StateFrame):
+        return cast(StateFrame, noted)
+    if noted is not None:
+        raise DatasetError(
+            f"{row.name}: its state frame is {noted!r}; known are {list(get_args(StateFrame))}"
+        )
     return "ned_frd" if np.median(state[:, SPECIFIC_FORCE][:, 2]) < 0 else "enu_flu"
 
 

@@ -1,28 +1,18 @@
 """Reading of JSON and Arrow columns; faults are raised as ``DatasetError``."""
 
 from pathlib import Path
-from typing import cast, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy.contract import FloatArray, StateFrame
+from policy.contract import FloatArray
 from policy.data.flight_data import DatasetError, Nanoseconds
 from policy.files import library_name
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
-
-
-def parse_state_frame(name: str, value: object) -> StateFrame:
-    """Return the state frame with this name in a file."""
-    if value not in get_args(StateFrame):
-        raise DatasetError(
-            f"{name}: its state frame is {value!r}; known are {list(get_args(StateFrame))}"
-        )
-    return cast(StateFrame, value)
 
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:

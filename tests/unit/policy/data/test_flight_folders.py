@@ -151,7 +151,8 @@ def contract(**terms: object) -> dict[str, object]:
         ("[]", {}, "not a JSON object"),
         ({"format": "other"}, {}, "not a flight of mavbridge"),
         ({"version": 2}, {}, "version 2"),
-        ({"contract": None}, {}, "state frame is"),
+        ({"contract": None}, {}, "a: the contract is not a JSON object"),
+        ({"contract": {"state_frame": "body"}}, {}, "state_frame must be 'ned_frd' or 'enu_flu'"),
         ({}, {"expert": [STICK, (0, math.nan, 0, 0), STICK]}, "expert holds NaN .* in row 1"),
         ({}, {"state": [(900.0, *LEVEL[1:])] * 3}, "vx_mps reaches 900"),
         ({}, {"expert": [(2.0, 0, 0, 0)] * 3}, "target must be sticks"),
@@ -159,7 +160,7 @@ def contract(**terms: object) -> dict[str, object]:
         ({}, {"expert": [None] * 3}, "nobody to learn from"),
         (contract(action="velocity"), {}, "was flown by velocity: .* from sticks and body"),
         (contract(action="rates", state_frame="enu_flu"), {}, "learns body rates in ned_frd alone"),
-        (contract(action="rates", hover_thrust=0.0), {}, "0.0 in its contract is no number above"),
+        (contract(action="rates", hover_thrust=0.0), {}, "hover_thrust must be in .*, got 0.0"),
         (contract(action="rates"), {"expert": None}, "without an expert"),
     ],
 )
