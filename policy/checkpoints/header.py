@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from policy.contract import Contract
-from policy.errors import CheckpointError
+from policy.errors import CheckpointError, ContractError
 from policy.files import open_regular, open_safetensors, read_json, stand_in_of
 
 HEAD_BYTES = 4096
@@ -161,4 +161,7 @@ def read_contract(path: Path) -> Contract | None:
     with open_safetensors(path, "numpy") as file:
         header: dict[str, str] = file.metadata() or {}
     require_header(path, header)
-    return Contract.from_json(header[CONTRACT_KEY])
+    try:
+        return Contract.from_json(header[CONTRACT_KEY])
+    except ContractError as error:
+        raise CheckpointError(f"{path}: {error}") from error
