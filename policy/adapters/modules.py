@@ -9,7 +9,7 @@ import inspect
 import json
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -32,32 +32,24 @@ PARTS = "forward alone, visual_encoder and action_head, or visual_encoder and de
 
 
 def adopt_modules(
-    name: str,
-    holder: object,
-    interface: Interface,
-    *,
-    schedule: NoiseSchedule | None,
-    seed: int,
-    inputs: Mapping[str, str] | None = None,
-    outputs: Mapping[str, str | int] | None = None,
+    name: str, holder: object, description: Description, seed: int
 ) -> SingleRatePolicy | None:
     """Return the policy made of the modules or methods of ``holder``, or None if it has none.
 
-    A contract without feature_dim gets it from the encoder's output. ``inputs`` names the state of
-    a forward that takes no image. ``outputs`` selects the result of a module that returns several
-    values. Both are as in ``adapters.description``.
+    A contract without feature_dim gets it from the encoder's output. Of the description's inputs
+    only the state's name is used, for a forward that takes no image.
     """
     encoder, head, denoiser = (
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
     )
-    picks, modules = outputs or {}, modules_of(holder)
+    interface, picks, modules = description.interface, description.outputs, modules_of(holder)
     if encoder is None and head is None and denoiser is None:
         if not _has_forward(holder):
             return None
         call = _Call(name, holder, "chunk", picks)
-        call.skip = int(_takes_no_image(call, interface, (inputs or {}).get("state")))
+        call.skip = int(_takes_no_image(call, interface, description.inputs.get("state")))
         call.require_order("image", "state", "action_history")
-        return _with_life(ForwardPolicy(interface, call, modules), holder)
+        return _owned(ForwardPolicy(interface, call), holder, modules)
     if encoder is None or (head is None) == (denoiser is None):
         raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
     for module in modules:
@@ -71,12 +63,13 @@ def adopt_modules(
     if head is not None:
         call = _Call(name, head, "chunk", picks)
         call.require_order("feature", "state", "action_history")
-        return _with_life(HeadPolicy(interface, encode, call, modules), holder)
-    schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
+        return _owned(HeadPolicy(interface, encode, call), holder, modules)
+    schedule = getattr(holder, "noise_schedule", None) or NoiseSchedule()
+    if description.schedule:
+        schedule = make_schedule(name, description.schedule)
     call = _Call(name, denoiser, "prediction", picks)
     call.require_order("noisy", "timestep", "feature", "state", "action_history")
-    policy = DenoiserPolicy(interface, encode, call, schedule, seed, modules)
-    return _with_life(policy, holder)
+    return _owned(DenoiserPolicy(interface, encode, call, schedule, seed), holder, modules)
 
 
 def load_torchscript(
@@ -90,23 +83,15 @@ def load_torchscript(
     except (RuntimeError, OSError) as error:
         raise CheckpointError(why_unreadable(path, error)) from error
     contract = replace(description.interface.contract, arrays="torch")
-    schedule = make_schedule(path, description.schedule) if description.schedule else None
-    policy = adopt_modules(
-        spec,
-        module,
-        replace(description.interface, contract=contract),
-        schedule=schedule,
-        seed=seed,
-        inputs=description.inputs,
-        outputs=description.outputs,
-    )
+    interface = replace(description.interface, contract=contract)
+    policy = adopt_modules(spec, module, replace(description, interface=interface), seed)
     if policy is None:
         raise CheckpointError(f"--policy {spec}: the archive has none of {PARTS}")
     return policy
 
 
-def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
-    """Return the schedule of a description; a PolicyError names the file of a wrong field."""
+def make_schedule(where: object, fields: dict[str, Any]) -> NoiseSchedule:
+    """Return the schedule of a description; a PolicyError names ``where`` a wrong field stands."""
     try:
         return NoiseSchedule(**fields)
     except (TypeError, PolicyError) as error:
@@ -122,10 +107,9 @@ class ForwardPolicy(nn.Module):
     Calls take and return tensors, or numpy arrays if the contract says so.
     """
 
-    def __init__(self, interface: Interface, call: Call, held: Iterable[nn.Module] = ()) -> None:
+    def __init__(self, interface: Interface, call: Call) -> None:
         super().__init__()
         self.contract = interface.contract
-        self.held = nn.ModuleList(held)
         self._call, self._interface = call, interface
 
     def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
@@ -146,10 +130,8 @@ class ForwardPolicy(nn.Module):
 class HeadPolicy(ForwardPolicy):
     """Dual rate: an encoder, and a head that makes a chunk in one call."""
 
-    def __init__(
-        self, interface: Interface, encode: Call, head: Call, held: Iterable[nn.Module] = ()
-    ) -> None:
-        super().__init__(interface, head, held)
+    def __init__(self, interface: Interface, encode: Call, head: Call) -> None:
+        super().__init__(interface, head)
         self._encode = encode
 
     def encode_visual(self, image: Any, camera: int = 0) -> Any:
@@ -175,9 +157,8 @@ class DenoiserPolicy(HeadPolicy):
         denoiser: Call,
         schedule: NoiseSchedule,
         seed: int,
-        held: Iterable[nn.Module] = (),
     ) -> None:
-        super().__init__(interface, encode, denoiser, held)
+        super().__init__(interface, encode, denoiser)
         if not isinstance(schedule, NoiseSchedule):
             raise PolicyError(
                 f"noise_schedule must be a policy.nets.diffusion.NoiseSchedule, got {schedule!r}"
@@ -218,8 +199,9 @@ def _with_feature(name: str, encode: Call, interface: Interface) -> Interface:
     return replace(interface, contract=replace(contract, feature_dim=dim))
 
 
-def _with_life(policy: ForwardPolicy, holder: object) -> ForwardPolicy:
-    """Add ``reset`` and ``close`` of the object that owns the modules to the policy."""
+def _owned(policy: ForwardPolicy, holder: object, modules: list[nn.Module]) -> ForwardPolicy:
+    """Add the modules, and ``reset`` and ``close`` of their owner, to the policy."""
+    policy.held = nn.ModuleList(modules)
     for name in ("reset", "close"):
         if (method := getattr(holder, name, None)) is not None:
             # Python cannot inspect the signature of a TorchScript method.

@@ -16,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 
+from policy.adapters.description import Description
 from policy.adapters.interface import Interface
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError, user_code, user_line
@@ -183,8 +184,8 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch
 
-        interface = Interface(contract=contract)
-        adopted = adopt_modules(f"--policy {spec}", policy, interface, schedule=None, seed=seed)
+        described = Description(interface=Interface(contract=contract))
+        adopted = adopt_modules(f"--policy {spec}", policy, described, seed)
         if adopted is not None:
             return adopted
     if not isinstance(contract, Contract):
