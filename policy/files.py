@@ -188,12 +188,15 @@ def read_object(path: Path, error: type[PolicyError], kind: str) -> dict[str, An
     return data
 
 
-def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML that a person wrote.
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read TOML that a person wrote.
 
     Raises:
-        ValueError: not TOML, nested too deeply, or a line longer than MAX_TOML_LINE.
+        OSError: it cannot be opened.
+        ValueError: not UTF-8, larger than MAX_TOML_BYTES, a line longer than MAX_TOML_LINE, not
+            TOML, or nested too deeply.
     """
+    text = read_text(path, MAX_TOML_BYTES)
     if (longest := max(map(len, text.split("\n")))) > MAX_TOML_LINE:
         raise ValueError(
             f"a line of it has {longest} characters, and may have {MAX_TOML_LINE}: write a long "
@@ -203,13 +206,3 @@ def parse_toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a settings file.
-
-    Raises:
-        OSError: it cannot be opened.
-        ValueError: not UTF-8, larger than MAX_TOML_BYTES, or not valid as in ``parse_toml``.
-    """
-    return parse_toml(read_text(path, MAX_TOML_BYTES))

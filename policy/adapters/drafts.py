@@ -191,9 +191,10 @@ def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | No
 
 
 def _width(feature: object) -> int:
-    shape = feature.get("shape") if isinstance(feature, dict) else None
-    is_vector = isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int)
-    return int(shape[0]) if is_vector and shape else 0
+    match feature:
+        case {"shape": [int(width)]}:
+            return width
+    return 0
 
 
 def _features(path: Path, data: Mapping[str, Any], name: str) -> dict[str, dict[str, Any]]:

@@ -44,15 +44,6 @@ class VideoParts(NamedTuple):
     skipped_bytes: int
     skipped_frames: int
 
-    def describe(self, path: Path) -> str | None:
-        """Return a sentence for the user; None if nothing was skipped."""
-        if not self.skipped_bytes:
-            return None
-        return (
-            f"{path} is damaged or cut off: {self.skipped_bytes} bytes and {self.skipped_frames} "
-            "whole images that need what is lost were skipped"
-        )
-
 
 def video_parts(path: Path) -> VideoParts:
     """Find the images of a video without decoding them; raises OSError."""
@@ -103,7 +94,12 @@ def with_images(
     parts = video_parts(path)
     found = [fragment.number for fragment in parts.fragments]
     places = np.flatnonzero(np.isin(numbers, found))
-    damage = [text] if (text := parts.describe(path)) else []
+    damage = []
+    if parts.skipped_bytes:
+        damage.append(
+            f"{path} is damaged or cut off: {parts.skipped_bytes} bytes and {parts.skipped_frames} "
+            "whole images that need what is lost were skipped"
+        )
     lost, extra = len(numbers) - len(places), len(found) - len(places)
     if is_whole and (lost or extra):
         damage.append(f"{path}: {lost} of its rows have no image, {extra} images have no row")

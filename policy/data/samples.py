@@ -1,7 +1,7 @@
 """Training samples from stamped flights, for any pair of an image and a later tick.
 
-They equal a policy's input in flight: history and motion come from ``policy.observation``, and the
-rows of a chunk are at the times where ``mavbridge.flight.history.sample_chunk`` expects them.
+They equal a policy's input in flight, as ``mavbridge.flight`` makes it: its history, the motion
+since the exposure, and the times of a chunk's rows.
 """
 
 from collections.abc import Sequence

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -9,7 +10,13 @@ import numpy as np
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
 from policy.errors import NoChunkError, PolicyError, user_code
 from policy.preprocess import image_to_input
-from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, StepwisePolicy
+from policy.protocol import (
+    DualRatePolicy,
+    PolicyRunner,
+    SingleRatePolicy,
+    StepwisePolicy,
+    predict_by_pair,
+)
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
@@ -113,16 +120,12 @@ def _solver(
 
 def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) -> Act:
     """Single rate: apply ``act`` to images [1, *contract.image_shape] instead of their features."""
-
-    def act_on_images(images: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        steps = images.reshape(-1, len(encode), 1, *images.shape[-3:])
-        features = [
-            encode_one(step[camera]) for step in steps for camera, encode_one in enumerate(encode)
-        ]
-        feature = np.concatenate(features, axis=1).reshape(1, *contract.feature_shape)
-        return act(feature, state, history)
-
-    return act_on_images
+    pair: Any = SimpleNamespace(
+        contract=contract,
+        encode_visual=lambda image, camera=0: encode[camera](image),
+        predict_fast=lambda feature, state, history, _: act(feature, state, history),
+    )
+    return lambda images, state, history: predict_by_pair(pair, images, state, history, 0)
 
 
 def to_numpy(array: Any) -> FloatArray:

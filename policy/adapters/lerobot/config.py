@@ -12,11 +12,11 @@ from types import NoneType
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from policy.contract import ACTION_DIM
+from policy.data.lerobot_format import ACTION_KEY, STATE_KEY
 from policy.errors import CheckpointError, warned
 from policy.files import read_object
 
 CONFIG_FILE = "config.json"
-STATE_KEY, ACTION_KEY = "observation.state", "action"
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
