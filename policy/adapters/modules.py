@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from policy.adapters.description import USUAL_NAMES, Description
 from policy.adapters.interface import Interface
-from policy.engines.torch_eager import modules_of
+from policy.engines.torch_engines import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise

@@ -21,7 +21,13 @@ from policy.contract import (
     FloatArray,
 )
 from policy.engines.runner import EngineName, ExecutionSettings, encode_all
-from policy.engines.torch_eager import changes, make_torch_runner, modules_of, snapshot
+from policy.engines.torch_engines import (
+    changes,
+    make_cuda_graph_runner,
+    make_torch_runner,
+    modules_of,
+    snapshot,
+)
 from policy.errors import Agreed, NoChunkError, PolicyError, warned
 from policy.nets.toge import BuiltinPolicy
 from policy.preprocess import SINCE_EXPOSURE_SCALE
@@ -220,7 +226,5 @@ def _candidates(
     if engine == "openvino":
         raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")
     if device == "cuda" and torch.cuda.is_available():
-        from policy.engines.cuda_graph import make_cuda_graph_runner
-
         return [("cuda-graph", partial(make_cuda_graph_runner, policy, settings))]
     return []

@@ -33,7 +33,7 @@ from policy.engines.runner import (
     Shape,
     make_runner,
 )
-from policy.engines.torch_eager import modules_of, run_eagerly
+from policy.engines.torch_engines import modules_of, run_eagerly
 from policy.errors import PolicyError, user_code
 from policy.nets.toge import BuiltinPolicy
 from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy

@@ -23,7 +23,7 @@ from policy.engines.runner import (
     level_state,
     make_numpy_runner,
 )
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.protocol import PolicyRunner

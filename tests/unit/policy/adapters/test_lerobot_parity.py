@@ -15,7 +15,7 @@ from policy.contract import STATE_NAMES
 from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 from policy.engines.runner import ExecutionSettings
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.errors import CheckpointError
 
 GOLDENS = Path(__file__).parents[3] / "data" / "lerobot"

@@ -26,7 +26,7 @@ from policy.adapters.export import export_onnx
 from policy.adapters.onnx import GraphFile, Wanted
 from policy.engines import choose
 from policy.engines.runner import ExecutionSettings
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest

@@ -13,9 +13,8 @@ from policy.engines.choose import (
     make_parity_samples,
     parity_failure,
 )
-from policy.engines.cuda_graph import make_cuda_graph_runner
 from policy.engines.runner import ExecutionSettings
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_cuda_graph_runner, make_torch_runner
 from policy.nets.toge import BuiltinPolicy, Toge, TogeConfig
 
 pytestmark = [

@@ -8,7 +8,7 @@ import torch
 
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input

@@ -23,7 +23,7 @@ from policy.engines.choose import (
     first_that_agrees,
 )
 from policy.engines.runner import ExecutionSettings
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.protocol import PolicyRunner

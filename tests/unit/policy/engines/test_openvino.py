@@ -22,7 +22,7 @@ from policy.engines.openvino_compile import (
 )
 from policy.engines.openvino_modules import MAX_UNROLLED, ModuleConverter, make_module_runner
 from policy.engines.runner import ExecutionSettings, Precision
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.toge import ResnetUnetConfig, TogeConfig

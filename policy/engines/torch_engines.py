@@ -1,0 +1,157 @@
+"""Engines of torch: operator by operator, the reference for every other engine, and CUDA graphs.
+
+And what a user's policy holds: its modules, and the attributes that change from call to call.
+"""
+
+import copy
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from policy.contract import FloatArray
+from policy.engines.runner import Compile, ExecutionSettings, Shape, make_runner, run_as
+from policy.errors import PolicyError
+from policy.protocol import PolicyRunner, SingleRatePolicy
+
+WARM_UP_CALLS = 3
+"""Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
+HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
+
+
+def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
+    """Wrap a torch policy for the loops: numpy in and out, no gradients, tried once.
+
+    A module is moved to the device. In dual rate, torch is set to one thread per operator in the
+    whole process.
+    """
+    if settings.dual_rate:
+        torch.set_num_threads(1)  # two loops infer at once: one core each, no contention
+    if isinstance(policy, nn.Module):
+        policy.to(settings.device).eval()
+    run = run_eagerly(settings.name, settings.device)
+    return make_runner(policy, run, run, engine="torch", settings=settings)
+
+
+def run_eagerly(name: str, device: str) -> Compile:
+    """ "Compile" a function for torch on a device: convert arrays to tensors and back."""
+    # torch.tensor copies: published arrays are read-only, which torch cannot express.
+    run = run_as(name, partial(torch.tensor, device=device), Tensor, "torch tensors")
+    return lambda method, shapes: torch.inference_mode()(run(method, shapes))
+
+
+def make_cuda_graph_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
+    """Capture a copy of the policy for the loops; tried once."""
+    if not isinstance(policy, nn.Module):
+        raise PolicyError(f"{settings.name} is no torch.nn.Module, so its work cannot be captured")
+    device = torch.device(settings.device)
+    return make_runner(
+        copy.deepcopy(policy).to(device).eval(),
+        partial(_Graph, stream=_stream(device, NORMAL_PRIORITY)),
+        partial(_Graph, stream=_stream(device, HIGH_PRIORITY)),
+        engine="cuda-graph",
+        settings=settings,
+    )
+
+
+def _stream(device: torch.device, priority: int) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device, priority)  # type: ignore[no-untyped-call]
+
+
+class _Graph:
+    """NVIDIA GPUs: a function that is captured once as a CUDA graph, then replayed; for one thread.
+
+    A replay launches hundreds of kernels in one call; otherwise an action head on a GPU spends its
+    time on launches. Each path has its own stream, the action's with high priority, so a tick does
+    not wait for an image. The encoder's kernels still run between the action's kernels.
+
+    Every graph reads and writes static memory. Inputs and results are copied through pinned memory
+    on the graph's own stream, and the caller waits for an event after the last copy. So nothing of
+    a replay is left in flight; encoded images are passed on as arrays, and no tensor is used on two
+    streams.
+    """
+
+    def __init__(
+        self, function: Callable[..., Tensor], shapes: Sequence[Shape], stream: torch.cuda.Stream
+    ) -> None:
+        self._stream = stream
+        self._pinned = [torch.zeros(shape, pin_memory=True) for shape in shapes]
+        # Wait for work of other streams that the capture depends on, such as the weights' copy.
+        torch.cuda.synchronize(stream.device)
+        with torch.cuda.device(stream.device), torch.cuda.stream(stream), torch.inference_mode():
+            self._inputs = [host.to(stream.device) for host in self._pinned]
+            for _ in range(WARM_UP_CALLS):
+                function(*self._inputs)
+            stream.synchronize()
+            self._graph = torch.cuda.CUDAGraph()
+            # thread_local: CUDA calls of other threads do not abort the capture.
+            with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
+                self._output = function(*self._inputs)
+            self._result = torch.zeros(self._output.shape, pin_memory=True)
+        self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def __call__(self, *arrays: FloatArray) -> FloatArray:
+        """Run the graph and return a copy of its output; reject arrays of another shape."""
+        for host, array in zip(self._pinned, arrays, strict=True):
+            if array.shape != tuple(host.shape):
+                raise PolicyError(f"an input must be {list(host.shape)}, got {list(array.shape)}")
+            np.copyto(host.numpy(), array)
+        with torch.cuda.stream(self._stream), torch.inference_mode():
+            for host, device in zip(self._pinned, self._inputs, strict=True):
+                device.copy_(host, non_blocking=True)
+            self._graph.replay()
+            self._result.copy_(self._output, non_blocking=True)
+            self._done.record(self._stream)
+        self._done.synchronize()  # without the GIL
+        return self._result.numpy().copy()
+
+
+def modules_of(policy: object) -> list[nn.Module]:
+    """Return the policy itself if it is a module, else the modules among its attributes."""
+    if isinstance(policy, nn.Module):
+        return [policy]
+    values = vars(policy).values() if hasattr(policy, "__dict__") else ()
+    return [value for value in values if isinstance(value, nn.Module)]
+
+
+def snapshot(policy: object) -> dict[str, object]:
+    """Return the attributes of a policy and of all its modules, by name, in a comparable form.
+
+    Tensors are compared by value, except the weights, which no forward call changes; numpy arrays,
+    numbers and texts by value; collections by the identity of their elements; other objects by
+    identity.
+    """
+    holders: dict[str, object] = {"": policy}
+    for at, module in enumerate(modules_of(policy)):
+        holders |= {f"{at}.{name}.": child for name, child in module.named_modules() if name}
+        holders[f"{at}."] = module
+    marks: dict[str, object] = {}
+    for path, holder in holders.items():
+        attributes = dict(vars(holder)) if hasattr(holder, "__dict__") else {}
+        attributes |= attributes.pop("_buffers", {})
+        attributes.pop("_parameters", None)
+        marks |= {f"{path}{name}": _mark(value) for name, value in attributes.items()}
+    return marks
+
+
+def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
+    """Return the names, without the path, of attributes that were added, removed or changed."""
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return sorted({name.rpartition(".")[2] for name in names})
+
+
+def _mark(value: object) -> object:
+    if isinstance(value, Tensor):
+        array = value.detach().cpu().contiguous()
+        return str(array.dtype), tuple(array.shape), array.float().numpy().tobytes()
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if value is None or isinstance(value, bool | int | float | str | bytes):
+        return value
+    if isinstance(value, dict):
+        return tuple((id(key), id(element)) for key, element in value.items())
+    if isinstance(value, Collection):
+        return tuple(map(id, value))
+    return id(value)
