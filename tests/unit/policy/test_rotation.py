@@ -14,16 +14,6 @@ def about(axis: int, angle: float) -> np.ndarray:
     return q
 
 
-@given(ANGLE, ANGLE, st.integers(0, 2), st.integers(0, 2))
-def test_a_product_rotates_as_its_factors_one_after_the_other(a, b, i, j):
-    first, second = about(i, a), about(j, b)
-    vector = np.array([[0.3, -1.2, 0.7]])
-    together = rotation.rotate(rotation.multiply(second, first), vector)
-    np.testing.assert_allclose(
-        together, rotation.rotate(second, rotation.rotate(first, vector)), atol=1e-12
-    )
-
-
 @given(ANGLE, st.integers(0, 2))
 def test_rotation_vector_is_axis_times_angle(angle: float, axis: int) -> None:
     expected = np.zeros((1, 3))

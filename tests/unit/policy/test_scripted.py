@@ -7,9 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from policy.contract import ActionKind, Contract
-from policy.motion.controllers import Measured, doublet_length_s, doublet_steps, measure
+from policy.motion.controllers import (
+    PROGRAM_NAMES,
+    Measured,
+    doublet_length_s,
+    doublet_steps,
+    measure,
+)
 from policy.motion.forward_motion import ForwardMotion, VehicleMotion
 from policy.motion.scripted import ScriptedPolicy
 from policy.motion.stick_loop import GRAVITY_MPS2
@@ -167,3 +175,18 @@ def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
     vehicle.now_s += 60.0
     throttle = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0, 0, 0]
     assert throttle > 0.2
+
+
+STATES = st.lists(st.floats(-50, 50, width=32), min_size=13, max_size=13)
+TICKS = st.lists(st.tuples(st.floats(0, 5), STATES), min_size=1, max_size=10)
+
+
+@given(program=st.sampled_from(PROGRAM_NAMES), ticks=TICKS)
+def test_any_flight_gives_finite_sticks_in_range(program, ticks):
+    now_s = 0.0
+    policy = ScriptedPolicy(program, lambda: now_s)
+    for step_s, state in ticks:
+        now_s += step_s
+        chunk = policy.predict_fast(FEATURE, np.array([state], np.float32), HISTORY, 10)
+        assert np.isfinite(chunk).all()
+        assert np.abs(chunk).max() <= 1.0

@@ -24,14 +24,16 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> None:
-    runner = make_torch_runner(small_toge, ExecutionSettings(name="toge", num_diffusion_steps=3))
+@pytest.mark.parametrize("steps", [1, 10])
+def test_two_rates_in_torch_match_the_net_called_directly(small_toge: Toge, steps: int) -> None:
+    settings = ExecutionSettings(name="toge", num_diffusion_steps=steps)
+    runner = make_torch_runner(small_toge, settings)
     assert (runner.engine, runner.dual_rate) == ("torch", True)
     feature = runner.encode(RGB)
     chunk = runner.act(frozen(feature), frozen(STATE), frozen(HISTORY))
     image = torch.tensor(image_to_input(RGB, small_toge.contract))
     with torch.inference_mode():
-        expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
+        expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), steps)
     assert feature.dtype == chunk.dtype == np.float32
     np.testing.assert_array_equal(chunk, expected.numpy())
 

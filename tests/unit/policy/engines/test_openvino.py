@@ -15,6 +15,7 @@ from policy.contract import Contract, FloatArray
 from policy.engines import openvino_compile
 from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_compile import (
+    MAX_BYTES,
     MAX_ENTRIES,
     CompileCache,
     precisions,
@@ -165,14 +166,6 @@ def test_a_signal_is_heard_whatever_has_become_of_the_engine() -> None:
 BLOB = b"a compiled graph" * 100
 
 
-def fill(cache: CompileCache, folder: Path, count: int) -> None:
-    """Store so many entries, each used a second after the one before."""
-    for index in range(count):
-        cache.store(str(index), BLOB)
-        newest = max(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-        os.utime(newest, (index, index))
-
-
 def test_keeps_what_was_stored_by_key_until_it_is_damaged(tmp_path: Path) -> None:
     cache = CompileCache(tmp_path / "new" / "folder")
     assert cache.load("a") is None
@@ -189,21 +182,21 @@ def test_keeps_what_was_stored_by_key_until_it_is_damaged(tmp_path: Path) -> Non
     assert cache.load("a") == b"newer"
 
 
-def test_files_have_a_size_together_that_they_do_not_exceed(tmp_path, monkeypatch):
-    monkeypatch.setattr(openvino_compile, "MAX_BYTES", 3 * len(BLOB))
+@pytest.mark.parametrize(
+    ("most_bytes", "kept"),
+    [(3 * len(BLOB), {0, 5}), (MAX_BYTES, {0, *range(2, MAX_ENTRIES + 1)})],
+)
+def test_the_least_recently_used_goes_first(tmp_path, monkeypatch, most_bytes, kept):
+    count = 5 if most_bytes < MAX_BYTES else MAX_ENTRIES
     cache = CompileCache(tmp_path)
-    fill(cache, tmp_path, 5)
-    assert [cache.load(str(index)) is not None for index in range(5)] == [False] * 3 + [True] * 2
-
-
-def test_the_least_recently_used_goes_first(tmp_path: Path) -> None:
-    cache = CompileCache(tmp_path)
-    fill(cache, tmp_path, MAX_ENTRIES)
+    for index in range(count):  # each a second after the one before
+        cache.store(str(index), BLOB)
+        newest = max(tmp_path.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        os.utime(newest, (index, index))
     assert cache.load("0") == BLOB  # used: now the newest
-    cache.store("one more", BLOB)
-    assert len(list(tmp_path.iterdir())) == MAX_ENTRIES
-    assert cache.load("1") is None
-    assert cache.load("0") == cache.load("2") == cache.load("one more") == BLOB
+    monkeypatch.setattr(openvino_compile, "MAX_BYTES", most_bytes)
+    cache.store(str(count), BLOB)
+    assert {n for n in range(count + 1) if cache.load(str(n)) is not None} == kept
 
 
 def test_a_folder_that_cannot_be_used_means_no_cache(tmp_path: Path) -> None:
