@@ -13,16 +13,16 @@ from sitl.px4.control import SIH_QUAD, STEP_NS
 from sitl.px4.flight import Px4Control, Setpoint
 from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
-from sitl.px4.sticks import RC_SOURCE, Px4Sticks, StickInput
+from sitl.px4.sticks import RC_SOURCE, Px4Sticks
 from sitl.vehicle.config import VehicleConfig
-from sitl.vehicle.firmware import STOPPED, Autopilot
+from sitl.vehicle.firmware import STOPPED
 
 RECEIVER_PERIOD_NS = NS_PER_S // 50
 RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground
 TAKEOFF_MARGIN_M = 0.2  # AUTO.TAKEOFF has arrived this far below its height
 
 
-class Px4(Autopilot):
+class Px4(Commander):
     """One boot of PX4, with the control period, airframe and noise of PX4's SIH.
 
     Every stamp is a multiple of the control period.
@@ -33,12 +33,9 @@ class Px4(Autopilot):
     gyro_noise_radps = math.radians(5.0)
     id_param = "MAV_SYS_ID"
     battery_mv = 16_200
-    params: Px4Params
 
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
-        self.stick_input = StickInput(params)
-        self.commander = Commander(params, self.stick_input, boot_ns, self.texts)
         self.receiver_us = config.receiver_us
         """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
         self.setpoint: Setpoint | None = None
@@ -51,20 +48,10 @@ class Px4(Autopilot):
         self._flown_mode = self.mode
 
     @property
-    def mode(self) -> Px4Mode:
-        return self.commander.mode
-
-    @property
-    def mode_name(self) -> str:
-        return self.mode.label
-
-    @property
-    def armed(self) -> bool:
-        return self.commander.armed
-
-    @property
-    def in_failsafe(self) -> bool:
-        return self.commander.in_failsafe
+    def setpoint_fresh(self) -> bool:
+        """True until the newest setpoint is COM_OF_LOSS_T old."""
+        age_ns = self.now_ns - self._setpoint_ns
+        return self.setpoint is not None and age_ns < self.params["COM_OF_LOSS_T"] * NS_PER_S
 
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
@@ -83,10 +70,9 @@ class Px4(Autopilot):
             self.receiver_us = tuple(values_us)
 
     def set_setpoint(self, setpoint: Setpoint, now_ns: int) -> None:
-        """Take a setpoint for OFFBOARD; the commander decides which modes use it."""
+        """Take a setpoint, which only OFFBOARD uses."""
         self.setpoint, self._setpoint_ns = setpoint, now_ns
         self.setpoint_count += 1
-        self.commander.setpoint_fresh = True
 
     def prepare_takeoff(self, height_m: float | None) -> None:
         above_m = self.params["MIS_TAKEOFF_ALT"] - self.sensed.position_ned_m[2]
@@ -95,7 +81,7 @@ class Px4(Autopilot):
     def _read_inputs(self) -> None:
         self._read_receiver()
         self.stick_input.update(self.now_ns)
-        self._update_commander()
+        super()._read_inputs()
 
     def _start_in_air(self) -> None:
         """Fly on in ALTCTL, unless setpoints fly it.
@@ -103,15 +89,14 @@ class Px4(Autopilot):
         Valid sticks and setpoints stay in effect. Without valid sticks, centred ones are assumed
         until the first real ones come.
         """
-        commander = self.commander
-        if commander.mode is not Px4Mode.OFFBOARD:
+        if self.mode is not Px4Mode.OFFBOARD:
             if not self.stick_input.valid:
                 self.stick_input.pretend_centred(self.now_ns)
-            commander.mode = commander.intended = self._flown_mode = Px4Mode.ALTCTL
-            commander.start(ignores_sticks=False)
+            self.mode = self.intended = self._flown_mode = Px4Mode.ALTCTL
+            self.start_motors(ignores_sticks=False)
         self._set_landed(landed=False)
         self.texts.clear()
-        commander.events.clear()
+        self.events.clear()
         self.flight.reset(self.sensed)
 
     def _read_receiver(self) -> None:
@@ -130,15 +115,6 @@ class Px4(Autopilot):
             sticks = Px4Sticks(forward=-pitch, right=roll, throttle=throttle, yaw=yaw)
             self.stick_input.on_sticks(RC_SOURCE, sticks, self.now_ns)
 
-    def _update_commander(self) -> None:
-        commander = self.commander
-        commander.estimator_ready = self.estimator_ready
-        commander.position_ready = self.position_ready
-        age_ns = self.now_ns - self._setpoint_ns
-        if self.setpoint is not None and age_ns >= self.params["COM_OF_LOSS_T"] * NS_PER_S:
-            commander.setpoint_fresh = False
-        commander.update(self.now_ns)
-
     def _motors(self) -> tuple[float, ...]:
         if not self.armed:
             return STOPPED
@@ -156,7 +132,7 @@ class Px4(Autopilot):
         )
         height_m = -self.sensed.position_ned_m[2]
         if height_m >= self.flight.takeoff_to_m - TAKEOFF_MARGIN_M:
-            self.commander.finish_takeoff()
+            self.finish_takeoff()
         return commands
 
     def _leaves_ground(self) -> bool:
@@ -175,7 +151,7 @@ class Px4(Autopilot):
                 self.flight.most_climb_mps, self._ramp_ns = math.inf, None
         if not self.landed:
             return True
-        armed_ns = self.now_ns - self.commander.armed_ns
+        armed_ns = self.now_ns - self._armed_ns
         sticks = self.stick_input.sticks
         if armed_ns < self.params["COM_SPOOLUP_TIME"] * NS_PER_S or not self.flight.wants_takeoff(
             self.mode, sticks, self.setpoint, self.sensed
@@ -188,10 +164,6 @@ class Px4(Autopilot):
                 return False
         self._set_landed(landed=False)
         return True
-
-    def _set_landed(self, *, landed: bool) -> None:
-        super()._set_landed(landed=landed)
-        self.commander.on_landed_change(landed=landed)
 
     @property
     def _is_pushing(self) -> bool:

@@ -4,13 +4,15 @@ The intended mode is the last one that the pilot or a command requested. The flo
 a failsafe may change it and leaves the intended one alone.
 """
 
+from abc import abstractmethod
 from typing import Literal, NamedTuple
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.modes import LostSticks, Phase, Px4Mode, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
-from sitl.vehicle.firmware import StatusText
+from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.firmware import Autopilot
 
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
 _AUTOPILOT_COMPONENT = 1 << 24
@@ -45,32 +47,34 @@ _BOOT_MODES = {1: Px4Mode.ALTCTL, 2: Px4Mode.POSCTL}
 """Modes of COM_FLTMODE_BOOT; 4, and any mode that this vehicle lacks, means Hold."""
 
 
-class Commander:
+class Commander(Autopilot):
     """Decides on mode and arming during one boot; texts and events wait in lists for the links."""
 
-    def __init__(
-        self, params: Px4Params, sticks: StickInput, boot_ns: int, texts: list[StatusText]
-    ) -> None:
-        self._params = params
-        self._sticks = sticks
-        self._boot_ns = self.now_ns = boot_ns
+    params: Px4Params
+    armed = False
+
+    def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
+        super().__init__(params, config, boot_ns)
         boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Px4Mode.AUTO_LOITER)
         self.mode = self.intended = self._last_armable = boot_mode
-        self.armed = False
-        self.landed = True  # set by the autopilot, as are readiness and setpoint_fresh
-        self.estimator_ready = self.position_ready = False
-        self.setpoint_fresh = False
+        self.stick_input = StickInput(params)
         self.lost_sticks = LostSticks(params)
         self.events: list[Event] = []  # events to send; the reader empties the list
-        self._texts = texts
         self._fallback = False
         self._sticks_missed = True  # the loss of sticks has been noticed
         self._was_lost = False
         self._ignores_sticks = False  # no failsafe: sticks were absent at arming
-        self.armed_ns = boot_ns
-        self._landed_ns = boot_ns
+        self._armed_ns = self._landed_ns = self._check_due_ns = boot_ns
         self._has_flown = False
-        self._check_due_ns = boot_ns
+
+    @property
+    @abstractmethod
+    def setpoint_fresh(self) -> bool:
+        """True while setpoints for OFFBOARD arrive."""
+
+    @property
+    def mode_name(self) -> str:
+        return self.mode.label
 
     @property
     def in_failsafe(self) -> bool:
@@ -78,7 +82,7 @@ class Commander:
 
     def can_fly(self, mode: Px4Mode) -> bool:
         """True if the mode has the sticks, position or stream of setpoints that it needs."""
-        if mode.piloted and not self._sticks.valid:
+        if mode.piloted and not self.stick_input.valid:
             return False
         if mode.needs_position and not self.position_ready:
             return False
@@ -101,7 +105,7 @@ class Commander:
         highest = 1.0
         if self.intended.piloted:
             highest = LOW_THROTTLE if self.intended.manual_throttle else MIDDLE_THROTTLE
-        throttle = self._sticks.sticks.throttle
+        throttle = self.stick_input.sticks.throttle
         is_low_enough = throttle < highest if self.intended.manual_throttle else throttle <= highest
         if not is_low_enough:
             self._deny(
@@ -109,16 +113,16 @@ class Commander:
                 "commander_arm_denied_throttle_unsafe",
             )
             return False
-        self.start(ignores_sticks=not self._sticks.valid)
+        self.start_motors(ignores_sticks=not self.stick_input.valid)
         self._say(SEVERITY_INFO, f"Armed by {reason}")
         self._emit("commander_armed_by")
         return True
 
-    def start(self, *, ignores_sticks: bool) -> None:
+    def start_motors(self, *, ignores_sticks: bool) -> None:
         self.armed, self._has_flown = True, False
-        self.armed_ns = self.now_ns
+        self._armed_ns = self.now_ns
         self._ignores_sticks = ignores_sticks
-        self._sticks_missed = not self._sticks.valid
+        self._sticks_missed = not self.stick_input.valid
 
     def disarm(self, *, force: bool, reason: ArmReason = "external command") -> bool:
         """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
@@ -158,21 +162,20 @@ class Commander:
         if self.intended is Px4Mode.AUTO_TAKEOFF:
             self._intend(Px4Mode.AUTO_LOITER)
 
-    def on_landed_change(self, *, landed: bool) -> None:
-        self.landed = landed
+    def _set_landed(self, *, landed: bool) -> None:
+        super()._set_landed(landed=landed)
         self._landed_ns = self.now_ns
         self._has_flown = self._has_flown or not landed
         what = "landing" if landed else "takeoff"
         self._say(SEVERITY_INFO, f"{what.capitalize()} detected")
         self._emit(f"commander_{what}_detected")
 
-    def update(self, now_ns: int) -> None:
-        dt_ns, self.now_ns = now_ns - self.now_ns, now_ns
+    def _read_inputs(self) -> None:
         self._read_gestures()
-        if self.lost_sticks.update(dt_ns):
+        if self.lost_sticks.update(self.step_ns):
             self._say_failsafe()
-        if now_ns >= self._check_due_ns:
-            self._check_due_ns = now_ns + CHECK_PERIOD_NS
+        if self.now_ns >= self._check_due_ns:
+            self._check_due_ns = self.now_ns + CHECK_PERIOD_NS
             self._watch_sticks()
         if self.armed:
             self._yield_to_pilot()
@@ -180,8 +183,8 @@ class Commander:
         self._choose_mode()
 
     def _read_gestures(self) -> None:
-        gesture = self._sticks.gesture.take(self.now_ns)
-        if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
+        gesture = self.stick_input.gesture.take(self.now_ns)
+        if not gesture or not self.params.integer("MAN_ARM_GESTURE"):
             return
         if gesture > 0:
             self.arm("stick gesture")
@@ -190,7 +193,7 @@ class Commander:
 
     def _watch_sticks(self) -> None:
         """Start the failsafe if sticks are lost in flight; sticks absent at arming are ignored."""
-        if self._sticks.valid:
+        if self.stick_input.valid:
             if self._sticks_missed and self._was_lost:
                 self._emit("commander_rc_regained")
             self._sticks_missed = self._ignores_sticks = False
@@ -202,7 +205,7 @@ class Commander:
         is_excepted = self.lost_sticks.is_excepted(self.intended)
         if not self.armed or self._ignores_sticks or is_excepted or self.lost_sticks.active:
             return
-        if not self._params.integer("NAV_RCL_ACT"):
+        if not self.params.integer("NAV_RCL_ACT"):
             return
         self.lost_sticks.start()
         is_held = self.lost_sticks.phase is Phase.HOLDING
@@ -211,10 +214,10 @@ class Commander:
     def _yield_to_pilot(self) -> None:
         """Let fast sticks take over an autonomous flight, except in a failsafe's Hold."""
         is_held = self.lost_sticks.phase is Phase.HOLDING
-        bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
+        bits = int(self.params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
         is_autonomous = bool(bits & 1) and self.mode.is_auto
         is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Px4Mode.OFFBOARD)
-        if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
+        if self.stick_input.moved_fast and is_autonomous and not is_held and not self.landed:
             was_failsafe = self.in_failsafe
             self._intend(Px4Mode.POSCTL if self.position_ready else Px4Mode.ALTCTL)
             if was_failsafe:
@@ -227,8 +230,8 @@ class Commander:
         if not self.landed:
             return
         name = "COM_DISARM_LAND" if self._has_flown else "COM_DISARM_PRFLT"
-        since_ns = self._landed_ns if self._has_flown else self.armed_ns
-        limit_s = self._params[name]
+        since_ns = self._landed_ns if self._has_flown else self._armed_ns
+        limit_s = self.params[name]
         if limit_s > 0.0 and self.now_ns - since_ns >= limit_s * NS_PER_S:
             self.disarm(
                 force=False, reason="landing" if self._has_flown else "auto preflight disarming"
@@ -243,7 +246,7 @@ class Commander:
             return
         wanted = self.intended
         if wanted is Px4Mode.OFFBOARD and not self.setpoint_fresh:
-            wanted = mode_without_stream(self._params, has_sticks=self._sticks.valid)
+            wanted = mode_without_stream(self.params, has_sticks=self.stick_input.valid)
         wanted = self._with_position(wanted)
         was_fallback, self._fallback = self._fallback, wanted is not self.intended
         self.mode = wanted
@@ -253,7 +256,7 @@ class Commander:
     def _with_position(self, mode: Px4Mode) -> Px4Mode:
         if self.position_ready or not mode.needs_position:
             return mode
-        is_stick_flown = mode is Px4Mode.POSCTL and self._sticks.valid
+        is_stick_flown = mode is Px4Mode.POSCTL and self.stick_input.valid
         return Px4Mode.ALTCTL if is_stick_flown else Px4Mode.AUTO_LAND
 
     def _intend(self, mode: Px4Mode) -> None:
@@ -276,7 +279,7 @@ class Commander:
 
     def _say(self, severity: int, text: str) -> None:
         # The tab marks a text that is also sent as an event; ground stations hide it.
-        self._texts.append(StatusText(severity, text + "\t"))
+        self._send_text(severity, text + "\t")
 
     def _emit(self, name: str) -> None:
-        self.events.append(Event(name, (self.now_ns - self._boot_ns) // NS_PER_MS))
+        self.events.append(Event(name, self.uptime_ns // NS_PER_MS))

@@ -80,7 +80,7 @@ class Px4Telemetry(Telemetry[Px4]):
     def build(self, number: int) -> Message | None:
         if number != CURRENT_MODE:
             return super().build(number)
-        mode, intended = self.ap.mode, self.ap.commander.intended
+        mode, intended = self.ap.mode, self.ap.intended
         payload = _CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard)
         return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
 
@@ -100,7 +100,7 @@ class Px4Telemetry(Telemetry[Px4]):
         elif ap.armed:
             status = mav.MAV_STATE_ACTIVE
         else:
-            status = mav.MAV_STATE_STANDBY if ap.commander.can_arm() else mav.MAV_STATE_UNINIT
+            status = mav.MAV_STATE_STANDBY if ap.can_arm() else mav.MAV_STATE_UNINIT
         kind = (mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_PX4)
         return (*kind, base_mode, ap.mode.custom_mode, status, 3)
 
@@ -108,7 +108,7 @@ class Px4Telemetry(Telemetry[Px4]):
         """PREARM_CHECK, never present, is healthy if health allows arming."""
         sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if self.ap.stick_input.valid else 0
         healthy = _SENSORS_HEALTHY | sticks
-        if self.ap.armed or self.ap.commander.can_arm():
+        if self.ap.armed or self.ap.can_arm():
             healthy |= mav.MAV_SYS_STATUS_PREARM_CHECK
         present = _SENSORS_PRESENT | sticks
         return self._health(present=present, enabled=_SENSORS_ENABLED, healthy=healthy)
@@ -189,7 +189,7 @@ def topic_version(message_id: int, ap: Px4) -> Hashable:
     if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
         return ap.stick_input.count
     if message_id == CURRENT_MODE:
-        return ap.mode, ap.commander.intended, _at_rate(ap, 500)
+        return ap.mode, ap.intended, _at_rate(ap, 500)
     return ap.uptime_ns
 
 

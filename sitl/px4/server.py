@@ -49,7 +49,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
 
     def _announce(self) -> None:
         """Send events before the texts."""
-        events = self._ap.commander.events
+        events = self._ap.events
         for event in events:
             for link in self.links:
                 link.send_event(event)
@@ -113,7 +113,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     ) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
         if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
-            self._ap.commander.refuse_frame(frame)
+            self._ap.refuse_frame(frame)
             return
         if mask & _IGNORE_VELOCITY:
             return
@@ -156,7 +156,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     def _to_mode(self, mode: Px4Mode, *, says_why: bool = True) -> int:
         if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
-        return ACCEPTED if self._ap.commander.set_mode(mode, says_why=says_why) else REJECTED
+        return ACCEPTED if self._ap.set_mode(mode, says_why=says_why) else REJECTED
 
     def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
         return self._to_mode(Px4Mode.AUTO_RTL)
@@ -167,15 +167,15 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
         if params[0] not in (0.0, 1.0):
             return None
-        force, commander = params[1] == FORCE, self._ap.commander
-        done = commander.arm() if params[0] else commander.disarm(force=force)
+        is_forced = params[1] == FORCE
+        done = self._ap.arm() if params[0] else self._ap.disarm(force=is_forced)
         return ACCEPTED if done else REJECTED
 
     def cmd_nav_takeoff(self, params: Params7, _link: Px4Endpoint) -> int:
         """Take off to param 7, an altitude above sea level; NaN: climb by MIS_TAKEOFF_ALT."""
         height_m = params[6] - Px4Telemetry.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
-        return ACCEPTED if self._ap.commander.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
+        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
 
     def cmd_preflight_reboot_shutdown(self, params: Params7, _link: Px4Endpoint) -> int:
         """Accept 0, a no-op. PX4 refuses a reboot while armed, and always in SITL."""

@@ -160,9 +160,9 @@ class OutputFlight(GuardFlight):
 
     def _forget_sticks(self) -> None:
         """Reset PX4 to a vehicle that was armed without sticks, none of which has ever moved."""
-        self.px4.commander.set_mode(Px4Mode.AUTO_LOITER)
+        self.px4.set_mode(Px4Mode.AUTO_LOITER)
         self.px4.stick_input.valid = self.px4.stick_input._never_ages = False
-        self.px4.commander.start(ignores_sticks=True)
+        self.px4.start_motors(ignores_sticks=True)
 
     def fly(self, seconds: float = 1.5) -> "OutputFlight":
         """Launch, engage by the key, and let the policy start its program at once."""

@@ -246,7 +246,7 @@ def test_a_failsafe_of_the_vehicle_is_left_alone(
     flight = OutputFlight(autopilot, kind).fly(1.2)
     at_ns = flight.clock.now_ns()
     if flight.is_px4:
-        flight.px4.commander.lost_sticks.phase = LostPhase.ACTING
+        flight.px4.lost_sticks.phase = LostPhase.ACTING
     else:
         flight.ardupilot.gcs_failsafe.active = True
         flight.ardupilot.set_mode(ArduMode.RTL)

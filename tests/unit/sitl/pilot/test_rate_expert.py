@@ -79,9 +79,9 @@ def test_it_flies_a_race_on_px4_with_its_heavy_drag() -> None:
     for _ in range(50):
         ap.step()
     send(RateCommand(0.0, 0.0, 0.0, 0.0))
-    ap.commander.intended = Px4Mode.OFFBOARD
+    ap.intended = Px4Mode.OFFBOARD
     ap.step()
-    assert ap.commander.arm(), ap.texts
+    assert ap.arm(), ap.texts
     log = fly(course, RateExpert(course, 8.0), ap, send, Disturbance(0, strength=0.0))
     assert not log.crashed
     assert log.next_gate is None

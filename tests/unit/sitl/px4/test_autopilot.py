@@ -41,7 +41,7 @@ def test_a_lost_position_leaves_posctl_for_altctl_and_gives_it_back(airborne):
     airborne.ap.position_lost = True
     airborne.run(0.2, {0: MID})
     assert airborne.ap.mode is Px4Mode.ALTCTL
-    assert airborne.ap.commander.intended is Px4Mode.POSCTL
+    assert airborne.ap.intended is Px4Mode.POSCTL
     refused = airborne.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
     assert refused == mav.MAV_RESULT_TEMPORARILY_REJECTED
     airborne.ap.position_lost = False
