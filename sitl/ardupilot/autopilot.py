@@ -122,15 +122,10 @@ class ArduCopter(Autopilot):
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
-        self._armed = False
         self._mode_switch = ModeSwitch()
         self._gesture = HeldGesture(GESTURE_NS)
         self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
-
-    @property
-    def armed(self) -> bool:
-        return self._armed
 
     @property
     def mode_name(self) -> str:
@@ -193,7 +188,7 @@ class ArduCopter(Autopilot):
         if refusal is not None and not force:
             self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
             return False
-        self._armed = True
+        self.armed = True
         self._armed_ns = self._idle_since_ns = self.now_ns
         self.control.enter(self.mode, self.sensed)
         self._send_text(SEVERITY_INFO, "Arming motors")
@@ -204,7 +199,7 @@ class ArduCopter(Autopilot):
         if self.armed and not (self.landed or force):
             return False
         if self.armed:
-            self._armed = False
+            self.armed = False
             self._send_text(SEVERITY_INFO, "Disarming motors")
         return True
 
@@ -253,7 +248,7 @@ class ArduCopter(Autopilot):
     def _start_in_air(self) -> None:
         """Fly on in ALT_HOLD, or in a mode flown by setpoints. An idle receiver commands a
         descent."""
-        self._armed = True
+        self.armed = True
         self._set_landed(landed=False)
         if not self.mode.is_guided:
             self.mode = Mode.ALT_HOLD

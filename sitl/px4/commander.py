@@ -51,7 +51,6 @@ class Commander(Autopilot):
     """Decides on mode and arming during one boot; texts and events wait in lists for the links."""
 
     params: Px4Params
-    armed = False
 
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
@@ -114,8 +113,7 @@ class Commander(Autopilot):
             )
             return False
         self.start_motors(ignores_sticks=not self.stick_input.valid)
-        self._say(SEVERITY_INFO, f"Armed by {reason}")
-        self._emit("commander_armed_by")
+        self._tell(f"Armed by {reason}", "commander_armed_by")
         return True
 
     def start_motors(self, *, ignores_sticks: bool) -> None:
@@ -133,8 +131,7 @@ class Commander(Autopilot):
             return False
         self.armed = self._fallback = False
         self.lost_sticks.clear()
-        self._say(SEVERITY_INFO, f"Disarmed by {reason}")
-        self._emit("commander_disarmed_by")
+        self._tell(f"Disarmed by {reason}", "commander_disarmed_by")
         if not self.intended.armable:
             self.intended = self._last_armable
         self.mode = self.intended
@@ -167,8 +164,7 @@ class Commander(Autopilot):
         self._landed_ns = self.now_ns
         self._has_flown = self._has_flown or not landed
         what = "landing" if landed else "takeoff"
-        self._say(SEVERITY_INFO, f"{what.capitalize()} detected")
-        self._emit(f"commander_{what}_detected")
+        self._tell(f"{what.capitalize()} detected", f"commander_{what}_detected")
 
     def _read_inputs(self) -> None:
         self._read_gestures()
@@ -223,8 +219,7 @@ class Commander(Autopilot):
             if was_failsafe:
                 self._emit("failsafe_rc_override")
             else:
-                self._say(SEVERITY_INFO, "Pilot took over using sticks")
-                self._emit("commander_rc_override")
+                self._tell("Pilot took over using sticks", "commander_rc_override")
 
     def _disarm_by_time(self) -> None:
         if not self.landed:
@@ -274,12 +269,12 @@ class Commander(Autopilot):
             self._deny(text, "commander_failsafe_enter_hold")
 
     def _deny(self, text: str, event: str) -> None:
-        self._say(SEVERITY_CRITICAL, text)
-        self._emit(event)
+        self._tell(text, event, SEVERITY_CRITICAL)
 
-    def _say(self, severity: int, text: str) -> None:
+    def _tell(self, text: str, event: str, severity: int = SEVERITY_INFO) -> None:
         # The tab marks a text that is also sent as an event; ground stations hide it.
         self._send_text(severity, text + "\t")
+        self._emit(event)
 
     def _emit(self, name: str) -> None:
         self.events.append(Event(name, self.uptime_ns // NS_PER_MS))

@@ -154,6 +154,7 @@ class Autopilot(ABC):
         self.config = config
         self.boot_ns = boot_ns
         self.now_ns = boot_ns  # time of the last control step
+        self.armed = False
         self.landed = True
         self.sensors_frozen = False
         """Injected fault: telemetry and control keep the last state while the physics goes on."""
@@ -170,10 +171,6 @@ class Autopilot(ABC):
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
         self._still_since_ns: int | None = boot_ns
-
-    @property
-    @abstractmethod
-    def armed(self) -> bool: ...
 
     @property
     @abstractmethod
