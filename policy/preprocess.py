@@ -128,12 +128,11 @@ def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
     return padded
 
 
-def least_source_px(contract: Contract) -> int:
-    """Return the smallest side of a camera image [px] of which no part has to be enlarged."""
+def least_source_px(contract: Contract) -> tuple[int, int]:
+    """Return the least height and width of a camera image [px] that need no enlarging."""
     top, left, bottom, right = contract.image_crop
-    return math.ceil(
-        max(contract.image_height / (bottom - top), contract.image_width / (right - left))
-    )
+    height, width = contract.image_height / (bottom - top), contract.image_width / (right - left)
+    return math.ceil(height), math.ceil(width)
 
 
 def _part(length: int, start: float, end: float) -> slice:

@@ -76,13 +76,16 @@ class CaptureSource:
         self.capture.release()
 
 
-def open_device(device: int | Path, *, image_size: int, clock: Clock) -> CaptureSource:
-    """Open a local camera: ``0`` or ``/dev/video0``. Raises CameraError."""
+def open_device(device: int | Path, *, image_size: tuple[int, int], clock: Clock) -> CaptureSource:
+    """Open a local camera: ``0`` or ``/dev/video0``. Raises CameraError.
+
+    ``image_size`` is the least height and width [pixels].
+    """
     is_path = isinstance(device, Path)
     capture = cv2.VideoCapture(str(device), cv2.CAP_V4L2) if is_path else cv2.VideoCapture(device)
     if not capture.isOpened():
         raise CameraError(f"camera {device} cannot be opened; {present_devices()}")
-    width, height = device_mode(image_size)
+    width, height = device_mode(*image_size)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
     failure = "has stopped delivering frames: was it unplugged?"
@@ -151,7 +154,7 @@ def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def device_mode(image_size: int) -> tuple[int, int]:
-    """Return the width and height to request, so that the short side covers ``image_size``."""
-    covering = (mode for mode in DEVICE_MODES if mode[1] >= image_size)
+def device_mode(height: int, width: int) -> tuple[int, int]:
+    """Return the width and height to request, so that they cover ``height`` and ``width``."""
+    covering = (mode for mode in DEVICE_MODES if mode[0] >= width and mode[1] >= height)
     return next(covering, DEVICE_MODES[-1])

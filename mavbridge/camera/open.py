@@ -88,7 +88,7 @@ def _is_stream(spec: str) -> bool:
 def open_camera(
     spec: str,
     *,
-    image_size: int,
+    image_size: tuple[int, int],
     clock: Clock,
     timeout_s: float = 10.0,
     latency_ms: float = 0.0,
@@ -101,8 +101,8 @@ def open_camera(
 
     Args:
         spec: one of FORMS.
-        image_size: side of the policy's square image [pixels]. A device is asked for a mode
-            that covers it; all other sources deliver their own size.
+        image_size: least height and width [pixels]. A device is asked for a mode that covers
+            them; all other sources deliver their own size.
         clock: time of the waits, and of the stamps made here.
         timeout_s: longest wait for the first frame; meanwhile a device or stream that cannot be
             opened is retried, and shared memory may appear.
@@ -176,7 +176,7 @@ def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None)
     )
 
 
-def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) -> Camera:
+def _open(spec: str, *, image_size: tuple[int, int], clock: Clock, is_depth: bool | None) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
@@ -203,9 +203,11 @@ def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) ->
 class BlankCamera:
     """Camera that delivers a black frame at each point of a time grid, and drops unread ones."""
 
-    def __init__(self, *, image_size: int, clock: Clock, is_depth: bool = False) -> None:
+    def __init__(
+        self, *, image_size: tuple[int, int], clock: Clock, is_depth: bool = False
+    ) -> None:
         self._clock = clock
-        shape = (image_size, image_size, *(() if is_depth else (3,)))
+        shape = (*image_size, *(() if is_depth else (3,)))
         self._rgb: CameraImage = np.zeros(shape, np.uint16 if is_depth else np.uint8)
         self._rgb.flags.writeable = False
         self._due_ns = clock.now_ns()

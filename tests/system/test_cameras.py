@@ -117,7 +117,7 @@ def test_check_says_rate_and_latency_and_refuses_the_other_kind(
     clock, config = MonotonicClock(), CameraConfig(camera_timeout=20)
     with sent(kind, tmp_path) as source:
         need = CameraNeeds(
-            name="", source=source, rate_hz=30, side_px=32, max_age_s=0.3, is_depth=is_depth
+            name="", source=source, rate_hz=30, size_px=(32, 32), max_age_s=0.3, is_depth=is_depth
         )
         rows = {
             row.name.removeprefix(source).strip(): row for row in camera_rows([need], config, clock)

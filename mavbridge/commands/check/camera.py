@@ -36,8 +36,8 @@ class CameraNeeds:
     """Name in the contract; empty for the only camera."""
     source: str
     rate_hz: float
-    side_px: int
-    """Least side of the image."""
+    size_px: tuple[int, int]
+    """Least height and width of the image."""
     max_age_s: float
     """Oldest image to act on."""
     is_flown_by: bool = True
@@ -99,7 +99,7 @@ def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
     require_present(need.source)
     return open_camera(
         need.source,
-        image_size=need.side_px,
+        image_size=need.size_px,
         clock=clock,
         timeout_s=config.camera_timeout,
         latency_ms=config.camera_latency,
@@ -144,8 +144,10 @@ def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[Che
 
 def _image_row(need: CameraNeeds, image: CameraImage) -> CheckRow:
     (height_px, width_px), is_depth = image.shape[:2], image.ndim == 2
+    least_height_px, least_width_px = need.size_px
+    is_small = height_px < least_height_px or width_px < least_width_px
     advice, is_covered = "", is_blank(image)
-    if need.is_flown_by and min(height_px, width_px) < need.side_px:
+    if need.is_flown_by and is_small:
         advice = "the image is smaller than what the policy takes, and is enlarged for it"
     if is_covered:
         what = "without any depth" if is_depth else "black or of one colour"
@@ -153,7 +155,7 @@ def _image_row(need: CameraNeeds, image: CameraImage) -> CheckRow:
     return _row(
         need,
         f"{width_px}x{height_px}{' depth' if is_depth else ''}",
-        f"{need.side_px} px a side or more",
+        f"{least_width_px}x{least_height_px} or more",
         part="image",
         warn=advice,
         no_go=advice if is_covered and need.is_flown_by else "",

@@ -118,7 +118,7 @@ def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeed
             name=name if len(names) > 1 else "",
             source=source,
             rate_hz=min(rate_hz, most_hz),
-            side_px=least_source_px(contract),
+            size_px=least_source_px(contract),
             max_age_s=max_age_s,
             is_flown_by=looks_at_images(config),
             is_depth=None if plan is None else contract.is_depth,

@@ -140,7 +140,7 @@ class _Session:
         wanted = self._config.camera
         camera = open_camera(
             wanted.sources[0],
-            image_size=self._config.camera_size,
+            image_size=(self._config.camera_size, self._config.camera_size),
             clock=self._clock,
             timeout_s=wanted.camera_timeout,
             latency_ms=wanted.camera_latency,

@@ -8,7 +8,7 @@ import pytest
 from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS
 from mavbridge.camera import capture
-from mavbridge.camera.capture import ExposureClock, open_device, open_stream
+from mavbridge.camera.capture import ExposureClock, device_mode, open_device, open_stream
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
@@ -41,7 +41,7 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
         return device
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
-    source = open_device(Path("/dev/video7"), image_size=300, clock=clock)
+    source = open_device(Path("/dev/video7"), image_size=(300, 300), clock=clock)
     assert opened_with == [("/dev/video7", cv2.CAP_V4L2)]
     assert device.settings == {cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}
     image = source.next_image()
@@ -50,6 +50,17 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
     with pytest.raises(CameraError, match="unplugged"):
         source.next_image()
     source.close()
+
+
+@pytest.mark.parametrize(
+    ("least", "mode"),
+    [
+        *[((96, 96), (640, 480)), ((480, 640), (640, 480)), ((360, 641), (1280, 720))],
+        *[((481, 96), (1280, 720)), ((720, 1280), (1280, 720)), ((2000, 2000), (1920, 1080))],
+    ],
+)
+def test_a_device_is_asked_for_the_smallest_mode_that_covers_both_sides(least, mode):
+    assert device_mode(*least) == mode
 
 
 @pytest.mark.parametrize("set_by_user", [None, "timeout;1"])
@@ -89,7 +100,7 @@ def test_h264_over_rtp_by_its_sdp_comes_in_order_and_one_frame_at_most_is_held_b
         sender.send(np.full((SIDE, SIDE, 3), 16 + 30 * (number % 8), np.uint8))
 
     with repeating(send):
-        camera = open_camera(str(sdp), image_size=64, clock=clock, timeout_s=20)
+        camera = open_camera(str(sdp), image_size=(64, 64), clock=clock, timeout_s=20)
     while camera.read(NS_PER_S) is not None:  # what was on its way
         pass
     read, last_ns = [], clock.now_ns()

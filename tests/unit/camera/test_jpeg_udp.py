@@ -174,7 +174,9 @@ def test_a_port_that_is_in_use_is_named():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 17204))
         with pytest.raises(CameraError, match=r"jpeg-udp:127.0.0.1:17204 .*in use"):
-            open_camera("jpeg-udp:17204", image_size=32, clock=MonotonicClock(), timeout_s=0.2)
+            open_camera(
+                "jpeg-udp:17204", image_size=(32, 32), clock=MonotonicClock(), timeout_s=0.2
+            )
 
 
 def test_a_picture_that_says_it_is_huge_is_not_decoded():

@@ -31,7 +31,7 @@ def test_live_sources(source, monkeypatch):
     asked = []
 
     def opener(name):
-        def refuse(source, *, clock, image_size=224):
+        def refuse(source, *, clock, image_size=(224, 224)):
             asked.append((name, source, image_size))
             raise CameraError("refused")
 
@@ -40,8 +40,12 @@ def test_live_sources(source, monkeypatch):
     for name in ("open_device", "open_stream"):
         monkeypatch.setattr(camera_open, name, opener(name))
     with pytest.raises(CameraError, match="refused"):
-        open_camera(str(source), image_size=224, clock=MonotonicClock(), timeout_s=0.1)
-    assert asked[0] == ("open_stream" if "://" in str(source) else "open_device", source, 224)
+        open_camera(str(source), image_size=(224, 224), clock=MonotonicClock(), timeout_s=0.1)
+    assert asked[0] == (
+        "open_stream" if "://" in str(source) else "open_device",
+        source,
+        (224, 224),
+    )
 
 
 @pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
@@ -50,7 +54,7 @@ def test_the_latency_lies_between_exposure_and_arrival(name, tmp_path, monkeypat
     writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()
-    camera = open_camera(name, image_size=224, clock=clock, latency_ms=120.5)
+    camera = open_camera(name, image_size=(224, 224), clock=clock, latency_ms=120.5)
     frame = camera.read(0)
     assert frame.captured_ns == START_NS - round(120.5 * NS_PER_MS)
     assert frame.rgb.shape == (32, 32, 3)
@@ -62,7 +66,7 @@ def test_the_latency_lies_between_exposure_and_arrival(name, tmp_path, monkeypat
 
 def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency(clock):
     with pytest.raises(UserError, match="--camera-latency 40 cannot be used with shm:fpv"):
-        open_camera("shm:fpv", image_size=224, clock=clock, latency_ms=40.0)
+        open_camera("shm:fpv", image_size=(224, 224), clock=clock, latency_ms=40.0)
     check_camera("shm:fpv")
     check_camera("rtsp://host/cam", latency_ms=40.0)
 
@@ -71,7 +75,12 @@ def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency(clock):
 @pytest.mark.parametrize(("timeout_s", "left_s"), [(3.0, [2, 1]), (2.5, [2, 1]), (0.4, [])])
 def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s, left_s, clock):
     lines = []
-    camera = {"image_size": 224, "clock": clock, "timeout_s": timeout_s, "report": lines.append}
+    camera = {
+        "image_size": (224, 224),
+        "clock": clock,
+        "timeout_s": timeout_s,
+        "report": lines.append,
+    }
     told = rf"within {timeout_s:g} s \(link.camera_timeout\): shm:mb-none"
     with pytest.raises(CameraError, match=told):
         open_camera("shm:mb-none", **camera)
@@ -91,7 +100,7 @@ def test_anything_else_is_refused_with_the_forms_there_are(spec):
 
 def test_a_device_that_is_not_there_is_refused():
     with pytest.raises(CameraError, match=r"within 0\.3 s .*camera 999 cannot be opened"):
-        open_camera("999", image_size=224, clock=MonotonicClock(), timeout_s=0.3)
+        open_camera("999", image_size=(224, 224), clock=MonotonicClock(), timeout_s=0.3)
     assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
 
 
@@ -110,10 +119,10 @@ def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth, clock)
     publisher = FramePublisher(name, 24, 16, is_depth=is_depth)
     publisher.publish(depth_scene(0)[:16, :24] if is_depth else scene(0)[:16, :24], START_NS)
     for wanted in (is_depth, None):
-        open_camera(f"shm:{name}", image_size=16, clock=clock, is_depth=wanted).close()
+        open_camera(f"shm:{name}", image_size=(16, 16), clock=clock, is_depth=wanted).close()
     found = "depth of 24x16" if is_depth else "RGB images of 24x16"
     with pytest.raises(UserError, match=rf"shm:{name} delivers {found}, .*\(image_channels\)"):
-        open_camera(f"shm:{name}", image_size=16, clock=clock, is_depth=not is_depth)
+        open_camera(f"shm:{name}", image_size=(16, 16), clock=clock, is_depth=not is_depth)
     publisher.close()
 
 
@@ -124,15 +133,15 @@ def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path, clock):
         video.append(depth_scene(number), number * NS_PER_S // 30)
     video.close()
     with pytest.raises(UserError, match=f"delivers depth of {SIDE}x{SIDE}, .* takes RGB"):
-        open_camera(str(path), image_size=32, clock=clock, is_depth=False)
-    camera = open_camera(str(path), image_size=32, clock=clock, is_depth=True)
+        open_camera(str(path), image_size=(32, 32), clock=clock, is_depth=False)
+    camera = open_camera(str(path), image_size=(32, 32), clock=clock, is_depth=True)
     for number in range(3):
         assert np.array_equal(camera.read(NS_PER_S).rgb, depth_scene(number))
     camera.close()
 
 
 def test_black_frames_come_on_a_grid_and_late_ones_are_dropped(clock):
-    camera = open_camera("none", image_size=32, clock=clock)
+    camera = open_camera("none", image_size=(32, 32), clock=clock)
     first = camera.read(BLANK_NS)
     assert camera.read(BLANK_NS // 2) is None
     second = camera.read(BLANK_NS)

@@ -155,7 +155,7 @@ def test_frames_come_from_a_program_which_ends_with_the_camera(tmp_path: Path, s
     file.write_bytes(encoded(picture(40)))
     body = f"{setup}\nwhile True:\n    write(open('{file}', 'rb').read()); time.sleep(0.01)"
     clock = MonotonicClock()
-    camera = open_camera(f"pipe:{python(body)}", image_size=16, clock=clock, latency_ms=20)
+    camera = open_camera(f"pipe:{python(body)}", image_size=(16, 16), clock=clock, latency_ms=20)
     with closing(camera):
         frame = camera.read(2_000 * NS_PER_MS)
         assert frame.rgb.shape == (HEIGHT, WIDTH, 3)

@@ -113,7 +113,7 @@ def test_any_value_of_any_field_gives_a_contract_or_an_error(name, value, throug
     mean, std = (np.float32(v) for v in (contract.image_mean_rgb, contract.image_std_rgb))
     with np.errstate(all="raise"):
         assert np.isfinite((np.float32(1.0) - mean) / std).all()
-    assert least_source_px(contract) <= 4_096_000
+    assert max(least_source_px(contract)) <= 4_096_000
     assert observation_ages_ns(contract)[0] <= 16 * 10**9
     for is_dual in (False, True):
         loops = Rates().loops(is_dual=is_dual, play_s=contract.play_s)

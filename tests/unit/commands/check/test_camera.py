@@ -15,7 +15,12 @@ SCENE = np.random.default_rng(0).integers(0, 255, (224, 224, 3)).astype(np.uint8
 
 
 def needs(source: str = "shm:fpv", **changed: object) -> CameraNeeds:
-    values: dict[str, object] = {"name": "", "rate_hz": 30.0, "side_px": 224, "max_age_s": 0.3}
+    values: dict[str, object] = {
+        "name": "",
+        "rate_hz": 30.0,
+        "size_px": (224, 224),
+        "max_age_s": 0.3,
+    }
     return CameraNeeds(source=source, **(values | changed))  # type: ignore[arg-type]
 
 
@@ -52,6 +57,8 @@ def test_a_camera_that_does_all_that_is_needed_is_a_go() -> None:
         (needs(), seen(image=np.zeros_like(SCENE)), 0.0, "image", "no-go"),
         (needs(is_flown_by=False), seen(image=np.zeros_like(SCENE)), 0.0, "image", "warn"),
         (needs(), seen(image=SCENE[:160, :160]), 0.0, "image", "warn"),  # it is enlarged
+        (needs(size_px=(160, 224)), seen(image=SCENE[:160]), 0.0, "image", "go"),
+        (needs(size_px=(160, 224)), seen(image=SCENE[:, :160]), 0.0, "image", "warn"),
     ],
 )
 def test_what_a_policy_cannot_fly_by_is_told(
