@@ -188,8 +188,10 @@ class CameraConfig(Ranged):
     @property
     def _named(self) -> tuple[tuple[str, str], ...]:
         """Name and source of each camera; the name is empty if not given."""
-        matches = [re.fullmatch(r"(?:([A-Za-z_]\w*)=)?(.*)", text) for text in self.camera]
-        return tuple((match[1] or "", match[2]) for match in matches if match)
+        return tuple(
+            (name, source) if equals and name.isidentifier() else ("", name + equals + source)
+            for name, equals, source in (text.partition("=") for text in self.camera)
+        )
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -15,6 +15,8 @@ from mavbridge.core.errors import UserError
         (("front=http://host/?a=b",), ("front",), ("http://host/?a=b",)),
         (("./a=b.mp4",), ("front",), ("./a=b.mp4",)),
         (("screen:A=B",), ("front",), ("screen:A=B",)),
+        (("pipe:sh -c 'a\nb=c'",), ("front",), ("pipe:sh -c 'a\nb=c'",)),
+        (("down=pipe:a\nb", "front=0"), ("front", "down"), ("0", "pipe:a\nb")),
     ],
 )
 def test_each_camera_of_the_policy_gets_its_source(
