@@ -167,7 +167,7 @@ class PictureCutter(FrameCutter):
     def _find_end(self, arrived_ns: int) -> int | None:
         if self._at == 0 and not self._find_start(arrived_ns):
             return None
-        if not (self._find_png_end() if self._is_png else self._find_jpeg_end()):
+        if not (self._find_png_end() if self._is_png else self._find_jpeg_end(arrived_ns)):
             if len(self._buffer) > MAX_JPEG_BYTES:
                 raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
             return None
@@ -189,8 +189,11 @@ class PictureCutter(FrameCutter):
         del self._buffer[: start.start()]
         return True
 
-    def _find_jpeg_end(self) -> bool:
-        """Walk over the segments of the picture. Return True if it ends at ``_at``."""
+    def _find_jpeg_end(self, arrived_ns: int) -> bool:
+        """Walk over the segments of the picture. Return True if it ends at ``_at``.
+
+        If another picture starts before, the first was cut off, and is dropped.
+        """
         buffer = self._buffer
         while True:
             if self._in_scan:
@@ -207,13 +210,15 @@ class PictureCutter(FrameCutter):
             if marker == _EOI:
                 self._at += 2
                 return True
+            if marker == _SOI[1]:
+                del buffer[: self._at]
+                self._at, self._first_ns = len(_SOI), arrived_ns
+                continue
             if marker == _FILL:
                 self._at += 1
                 continue
-            if len(buffer) < self._at + 4:
-                return False
             length = int.from_bytes(buffer[self._at + 2 : self._at + 4], "big")
-            if len(buffer) < self._at + 2 + length:
+            if len(buffer) < self._at + 2 + max(length, 2):
                 return False
             self._at += 2 + length
             self._in_scan = marker == _SOS

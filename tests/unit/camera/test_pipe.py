@@ -142,6 +142,19 @@ def test_depth_comes_as_png_of_16_bits_or_raw_and_no_other_picture_is_depth() ->
         assert (picture.dtype, picture.shape) == (np.uint8, (SIDE, SIDE, 3))
 
 
+@pytest.mark.parametrize("size", [1, 7, 4096])
+def test_a_picture_that_is_cut_off_costs_itself_alone(size: int) -> None:
+    whole = encoded(scene(1))
+    for kept in (2, whole.index(b"\xff\xda"), len(whole) // 2, len(whole) - 1):
+        data, cutter = whole[:kept] + whole, PictureCutter()
+        starts = range(0, len(data), size)
+        for number in starts:
+            cutter.put(data[number : number + size], number)
+        first_ns = max(number for number in starts if number <= kept + (size == 1))
+        assert cutter.take() == (whole, first_ns)
+        assert cutter.rest() == ""
+
+
 @pytest.mark.parametrize("data", [b"no pictures here " * 400, b"\xff\xd8junk"])
 def test_garbage_ends_in_a_clear_error(data: bytes) -> None:
     with pytest.raises(CameraError, match="no MJPEG"):
