@@ -115,6 +115,8 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
             frame = camera.read(_READ_NS)
             if frame is None:
                 continue
+            if seen.image is None:
+                dropped_before = camera.dropped_frames
             seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
             seen.captured_ns.append(frame.captured_ns)
             seen.image = frame.rgb

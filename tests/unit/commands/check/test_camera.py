@@ -5,10 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.fakes import FakeClock
+from mavbridge.commands.check import camera as check_camera
 from mavbridge.commands.check.camera import CameraNeeds, CameraView, camera_rows, judge
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
+from mavbridge.core.records import Frame
 
 FRAME_NS = 33_333_333
 SCENE = np.random.default_rng(0).integers(0, 255, (224, 224, 3)).astype(np.uint8)
@@ -65,6 +68,26 @@ def test_what_a_policy_cannot_fly_by_is_told(
     need: CameraNeeds, what: CameraView, latency_ms: float, row: str, verdict: str
 ) -> None:
     assert rows(need, what, latency_ms)[row].verdict == verdict
+
+
+def test_frames_that_nobody_read_before_the_first_one_do_not_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = FakeClock()
+
+    class Camera:
+        dropped_frames = 0
+
+        def read(self, _timeout_ns: int) -> Frame:
+            clock.advance_ns(2 * FRAME_NS)
+            self.dropped_frames = 30  # while another camera was opened
+            return Frame(frame_id=1, captured_ns=clock.now_ns(), rgb=SCENE)
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(check_camera, "open_camera", lambda *_, **__: Camera())
+    assert camera_rows([needs()], CameraConfig(), clock)[0].found == "15.0 Hz"
 
 
 def test_a_camera_that_is_not_there_is_one_row(tmp_path: Path) -> None:
