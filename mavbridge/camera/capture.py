@@ -39,15 +39,21 @@ class ExposureClock:
     """
 
     is_ours: bool = False
+    latency_ns: int = 0
+    """Time from exposure to arrival, as given by the user."""
 
     def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """Return the stamp if the source stamps on our clock, else the arrival.
+        """Return the stamp if the source stamps on our clock, else the arrival less the latency.
+
+        A stamp within the latency is no exposure: drivers may stamp the start of the transfer.
 
         Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
         (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
         """
         self.is_ours = self.is_ours or 0 <= arrived_ns - stamp_ns <= MAX_FIRST_AGE_NS
-        return stamp_ns if self.is_ours and stamp_ns > 0 else arrived_ns
+        latest_ns = arrived_ns - self.latency_ns
+        is_exposure = stamp_ns > 0 and not latest_ns < stamp_ns <= arrived_ns
+        return stamp_ns if self.is_ours and is_exposure else latest_ns
 
 
 @dataclass(slots=True)
@@ -76,7 +82,9 @@ class CaptureSource:
         self.capture.release()
 
 
-def open_device(device: int | Path, *, image_size: tuple[int, int], clock: Clock) -> CaptureSource:
+def open_device(
+    device: int | Path, *, image_size: tuple[int, int], clock: Clock, latency_ns: int = 0
+) -> CaptureSource:
     """Open a local camera: ``0`` or ``/dev/video0``. Raises CameraError.
 
     ``image_size`` is the least height and width [pixels].
@@ -89,7 +97,8 @@ def open_device(device: int | Path, *, image_size: tuple[int, int], clock: Clock
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
     failure = "has stopped delivering frames: was it unplugged?"
-    return CaptureSource(capture, f"camera {device}", failure, clock, has_driver_stamps=True)
+    name, stamps = f"camera {device}", ExposureClock(latency_ns=latency_ns)
+    return CaptureSource(capture, name, failure, clock, has_driver_stamps=True, stamps=stamps)
 
 
 def present_devices() -> str:

@@ -129,12 +129,12 @@ class FrameAssembler:
 class JpegUdpSource:
     """`ImageSource` over a UDP port; returns the newest whole frame."""
 
-    def __init__(self, host: str, port: int, *, clock: Clock) -> None:
+    def __init__(self, host: str, port: int, *, clock: Clock, latency_ns: int = 0) -> None:
         """Bind the port. Raises CameraError on failure."""
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
-        self._stamps = ExposureClock()
+        self._stamps = ExposureClock(latency_ns=latency_ns)
         self._datagrams = self._bad_frames = 0
         self._silent_after_ns = clock.now_ns() + SILENT_NS
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

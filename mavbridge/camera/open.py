@@ -106,7 +106,7 @@ def open_camera(
         clock: time of the waits, and of the stamps made here.
         timeout_s: longest wait for the first frame; meanwhile a device or stream that cannot be
             opened is retried, and shared memory may appear.
-        latency_ms: time from exposure to arrival, subtracted from the stamps.
+        latency_ms: time from exposure to arrival; see `ExposureClock` for sources with stamps.
         report: gets a line of a countdown for every second of the wait.
         is_depth: True: the policy takes depth; False: RGB; None: either.
 
@@ -115,7 +115,8 @@ def open_camera(
         CameraError: no frame came in time, or the source cannot be used.
     """
     check_camera(spec, latency_ms=latency_ms)
-    camera = _open(spec, image_size=image_size, clock=clock, is_depth=is_depth)
+    latency_ns = round(latency_ms * NS_PER_MS)
+    camera = _open(spec, image_size, clock=clock, latency_ns=latency_ns, is_depth=is_depth)
     first: Image | Frame | None = camera.upcoming if isinstance(camera, VideoFileCamera) else None
     try:
         if isinstance(camera, Grabber | SharedMemoryCamera):
@@ -125,9 +126,9 @@ def open_camera(
     except BaseException:
         camera.close()
         raise
-    if latency_ms == 0.0:
+    if latency_ns == 0 or _is_device(spec) or spec.startswith("jpeg-udp:"):
         return camera
-    return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
+    return LatencyCompensatedCamera(camera, latency_ns=latency_ns)
 
 
 def _wait_for_first_frame(
@@ -176,12 +177,14 @@ def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None)
     )
 
 
-def _open(spec: str, *, image_size: tuple[int, int], clock: Clock, is_depth: bool | None) -> Camera:
+def _open(
+    spec: str, size: tuple[int, int], *, clock: Clock, latency_ns: int, is_depth: bool | None
+) -> Camera:
     kind, _, rest = spec.partition(":")
     if kind == "shm":
         return SharedMemoryCamera(rest, clock=clock)
     if spec == NO_CAMERA:
-        return BlankCamera(image_size=image_size, clock=clock, is_depth=bool(is_depth))
+        return BlankCamera(image_size=size, clock=clock, is_depth=bool(is_depth))
     if kind == "screen":
         from mavbridge.camera.screen import ScreenCamera
 
@@ -190,13 +193,14 @@ def _open(spec: str, *, image_size: tuple[int, int], clock: Clock, is_depth: boo
         return Grabber(partial(PipeSource, parse_pipe(rest), clock=clock), clock=clock)
     if kind == "jpeg-udp":
         host, port = parse_jpeg_udp(rest)
-        return Grabber(partial(JpegUdpSource, host, port, clock=clock), clock=clock)
+        receiver = partial(JpegUdpSource, host, port, clock=clock, latency_ns=latency_ns)
+        return Grabber(receiver, clock=clock)
     if _is_stream(spec):
         return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
     if _is_device(spec):
         device = int(spec) if spec.isdecimal() else Path(spec)
-        opener = partial(open_device, device, image_size=image_size, clock=clock)
-        return Grabber(opener, clock=clock)
+        opener = partial(open_device, image_size=size, clock=clock, latency_ns=latency_ns)
+        return Grabber(partial(opener, device), clock=clock)
     return VideoFileCamera(Path(spec), clock=clock)
 
 
@@ -230,7 +234,7 @@ class BlankCamera:
 
 
 class LatencyCompensatedCamera:
-    """Wrapper that moves a camera's stamps back by its latency from exposure to arrival."""
+    """Wrapper that moves arrival stamps back by the camera's latency from exposure to arrival."""
 
     def __init__(self, camera: Camera, *, latency_ns: int) -> None:
         """Wrap an open camera; closing the wrapper closes it."""

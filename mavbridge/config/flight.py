@@ -169,7 +169,7 @@ class CameraConfig(Ranged):
     camera_timeout: Annotated[float, hidden("link.camera-timeout"), Between(0.1, 3600, "s")] = 10.0
     """Seconds to wait for the camera's first frame."""
     camera_latency: Annotated[float, Between(0, 2000, "ms")] = 0.0
-    """Milliseconds from exposure to arrival, if frames carry no stamps."""
+    """Milliseconds from exposure to arrival; a frame may be stamped older, not younger."""
     max_frozen_image: Annotated[float, hidden("limits.frozen-image"), Between(0, 60, "s")] = 0.5
     """Longest time in seconds for which the image may stay identical in flight; 0 = no limit."""
     max_black_image: Annotated[float, hidden("limits.black-image"), Between(0, 60, "s")] = 0.5

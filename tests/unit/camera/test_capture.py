@@ -33,6 +33,21 @@ def test_the_drivers_stamp_is_taken_if_it_can_be_one(stamp_ms, is_our_clock, cap
     assert stamps.exposure_ns(round(stamp_ms * NS_PER_MS), START_NS) == captured_ms * NS_PER_MS
 
 
+@pytest.mark.parametrize(
+    ("stamp_ms", "is_our_clock", "captured_ms"),
+    [
+        pytest.param(999_990.0, True, 999_980, id="of the transfer"),
+        pytest.param(999_900.0, True, 999_900, id="of the exposure"),
+        pytest.param(1_000_400.0, True, 1_000_400, id="ahead"),
+        pytest.param(0.0, True, 999_980, id="no stamp"),
+        pytest.param(-1.0, False, 999_980, id="not supported"),
+    ],
+)
+def test_no_stamp_makes_a_frame_younger_than_the_latency(stamp_ms, is_our_clock, captured_ms):
+    stamps = ExposureClock(is_our_clock, latency_ns=20 * NS_PER_MS)
+    assert stamps.exposure_ns(round(stamp_ms * NS_PER_MS), START_NS) == captured_ms * NS_PER_MS
+
+
 def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
     opened_with, device = [], FakeCapture([START_NS / NS_PER_MS - 7])
 

@@ -14,6 +14,7 @@ from helpers.camera_senders import (
     depth_scene,
     encoded,
     next_image,
+    repeating,
     scene,
 )
 from helpers.fakes import START_NS, FakeClock
@@ -138,6 +139,21 @@ def test_the_newest_frame_is_read_and_older_ones_are_left(host):
         assert np.array_equal(image.rgb, depth_scene(1))
         assert image.captured_ns == old_ns
     source.close()
+
+
+def test_the_latency_is_not_added_to_the_age_by_the_stamps():
+    clock, stamp_age_ns = MonotonicClock(), 400 * NS_PER_MS
+    picture = encoded(scene(0))
+    with UdpSender(17206) as sender:
+
+        def send(number):
+            sender.send(number, picture, stamp_ns=clock.now_ns() - stamp_age_ns)
+
+        with repeating(send):
+            camera = open_camera("jpeg-udp:17206", image_size=(32, 32), clock=clock, latency_ms=350)
+            frame = camera.read(NS_PER_S)
+    assert stamp_age_ns <= clock.now_ns() - frame.captured_ns < stamp_age_ns + 300 * NS_PER_MS
+    camera.close()
 
 
 def test_silence_says_what_has_come():

@@ -31,8 +31,8 @@ def test_live_sources(source, monkeypatch):
     asked = []
 
     def opener(name):
-        def refuse(source, *, clock, image_size=(224, 224)):
-            asked.append((name, source, image_size))
+        def refuse(source, *, clock, image_size=None, latency_ns=None):
+            asked.append((name, source, image_size, latency_ns))
             raise CameraError("refused")
 
         return refuse
@@ -40,12 +40,13 @@ def test_live_sources(source, monkeypatch):
     for name in ("open_device", "open_stream"):
         monkeypatch.setattr(camera_open, name, opener(name))
     with pytest.raises(CameraError, match="refused"):
-        open_camera(str(source), image_size=(224, 224), clock=MonotonicClock(), timeout_s=0.1)
-    assert asked[0] == (
-        "open_stream" if "://" in str(source) else "open_device",
-        source,
-        (224, 224),
-    )
+        open_camera(
+            str(source), image_size=(96, 224), clock=MonotonicClock(), timeout_s=0.1, latency_ms=3
+        )
+    expected = ("open_device", source, (96, 224), 3 * NS_PER_MS)
+    if "://" in str(source):
+        expected = ("open_stream", source, None, None)
+    assert asked[0] == expected
 
 
 @pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
