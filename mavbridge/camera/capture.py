@@ -75,7 +75,8 @@ class CaptureSource:
         if self.has_driver_stamps:
             stamp_ns = round(self.capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
             captured_ns = self.stamps.exposure_ns(stamp_ns, captured_ns)
-        return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self.capture, self.name))
+        rgb = retrieve_rgb(self.capture, self.name)
+        return Image(captured_ns, rgb, is_stamped=self.stamps.is_ours)
 
     def close(self) -> None:
         """See `ImageSource`."""

@@ -29,6 +29,8 @@ class Image(NamedTuple):
     captured_ns: int
     rgb: CameraImage
     """Owned by the receiver."""
+    is_stamped: bool = False
+    """True if the source tells the exposure."""
 
 
 class ImageSource(Protocol):
@@ -152,13 +154,16 @@ class Grabber:
             while not self._stopping.is_set():
                 if (image := source.next_image()) is None:
                     continue
-                captured_ns, rgb = image
+                captured_ns, rgb, is_stamped = image
                 rgb.flags.writeable = False
                 with self._changed:
                     self._frame_count += 1
                     self._dropped_frames += self._newest is not None
                     self._newest = Frame(
-                        frame_id=self._frame_count, captured_ns=captured_ns, rgb=rgb
+                        frame_id=self._frame_count,
+                        captured_ns=captured_ns,
+                        rgb=rgb,
+                        is_stamped=is_stamped,
                     )
                     self._silent_after_ns = self._clock.now_ns() + STALL_NS
                     self._changed.notify_all()

@@ -159,7 +159,7 @@ class JpegUdpSource:
         if (pixels := decode_picture(frame.picture)) is not None:
             self._bad_frames = 0
             captured_ns = self._stamps.exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
-            return Image(captured_ns=captured_ns, rgb=pixels)
+            return Image(captured_ns, pixels, is_stamped=self._stamps.is_ours)
         self._bad_frames += 1
         if self._bad_frames > MAX_BAD_FRAMES:
             raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")

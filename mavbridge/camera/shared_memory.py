@@ -116,7 +116,8 @@ class SharedMemoryCamera:
         if is_ahead or self._stamp_age_ns > STALL_NS:
             return None
         self.dropped_frames += skipped
-        return Frame(frame_id=self._first_id + newest_id, captured_ns=captured_ns, rgb=rgb)
+        frame_id = self._first_id + newest_id
+        return Frame(frame_id=frame_id, captured_ns=captured_ns, rgb=rgb, is_stamped=True)
 
     def _follow_name(self) -> None:
         """Map the file under the name if it has changed. Frame ids keep increasing."""

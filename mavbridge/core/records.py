@@ -30,6 +30,8 @@ class Frame:
     """Exposure if the source tells it, else arrival."""
     rgb: CameraImage
     """Read-only."""
+    is_stamped: bool = False
+    """True if the source tells the exposure."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,8 +24,6 @@ _READ_NS = NS_PER_S // 2
 _JOIN_S = 5.0
 _ENOUGH = 0.9
 """Least acceptable share of the wanted rate."""
-_ON_ARRIVAL_MS = 1.0
-"""A frame younger than this when it is read was stamped on arrival, not at its exposure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +53,8 @@ class CameraView:
     """Time from the stamp to the read of each frame."""
     image: CameraImage | None = None
     """The newest."""
+    is_stamped: bool = False
+    """True if the source tells the exposures."""
     dropped: int = 0
     failure: str | None = None
 
@@ -119,7 +119,7 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
                 dropped_before = camera.dropped_frames
             seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
             seen.captured_ns.append(frame.captured_ns)
-            seen.image = frame.rgb
+            seen.image, seen.is_stamped = frame.rgb, frame.is_stamped
     except CameraError as error:
         seen.failure = str(error)
     seen.dropped = camera.dropped_frames - dropped_before
@@ -171,7 +171,7 @@ def _age_row(need: CameraNeeds, seen: CameraView, latency_ms: float) -> CheckRow
     warn = ""
     if steps_back:
         warn = f"{steps_back} stamps do not rise: their source does not count on"
-    elif typical_ms < _ON_ARRIVAL_MS and not latency_ms and not need.source.startswith("shm:"):
+    elif not (seen.is_stamped or latency_ms):
         warn = (
             "frames are stamped as they arrive, so their true age is not known: measure the time "
             "from exposure to arrival, and give it as --camera-latency MS"

@@ -60,7 +60,7 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
     assert opened_with == [("/dev/video7", cv2.CAP_V4L2)]
     assert device.settings == {cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}
     image = source.next_image()
-    assert image.captured_ns == START_NS - 7 * NS_PER_MS
+    assert (image.captured_ns, image.is_stamped) == (START_NS - 7 * NS_PER_MS, True)
     assert image.rgb.tolist() == [[[3, 2, 1]]]
     with pytest.raises(CameraError, match="unplugged"):
         source.next_image()
@@ -97,7 +97,8 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     source = open_stream("udp://0.0.0.0:5600", clock=clock)
     assert seen == [set_by_user or capture.LOW_LATENCY_OPTIONS, "-8"]
     assert dict(os.environ) == before
-    assert source.next_image().captured_ns == START_NS
+    image = source.next_image()
+    assert (image.captured_ns, image.is_stamped) == (START_NS, False)
     with pytest.raises(CameraError, match="ended, or was silent"):
         source.next_image()
 

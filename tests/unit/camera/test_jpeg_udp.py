@@ -152,6 +152,7 @@ def test_the_latency_is_not_added_to_the_age_by_the_stamps():
         with repeating(send):
             camera = open_camera("jpeg-udp:17206", image_size=(32, 32), clock=clock, latency_ms=350)
             frame = camera.read(NS_PER_S)
+    assert frame.is_stamped
     assert stamp_age_ns <= clock.now_ns() - frame.captured_ns < stamp_age_ns + 300 * NS_PER_MS
     camera.close()
 

@@ -69,7 +69,7 @@ def test_the_newest_frame_wins_with_its_stamp_and_the_skipped_are_counted(camera
     for number in range(1, 7):
         writer.publish(grey(number), START_NS - number)
     frame = camera.read(0)
-    assert (frame.frame_id, frame.captured_ns) == (6, START_NS - 6)
+    assert (frame.frame_id, frame.captured_ns, frame.is_stamped) == (6, START_NS - 6, True)
     assert camera.dropped_frames == 5
     assert camera.read(30 * NS_PER_MS) is None  # given once
     late = SharedMemoryCamera(writer.path.name, clock=clock)
