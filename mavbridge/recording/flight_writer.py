@@ -185,6 +185,12 @@ class FlightWriter:
             table.flush()
 
     @property
+    def images_failure(self) -> str | None:
+        """Why images are missing although the rest is recorded; None: no known reason."""
+        reasons = (self.video_failure, *(video.misfit for video in self._videos))
+        return next((str(reason) for reason in reasons if reason), None)
+
+    @property
     def frames_written(self) -> int:
         """Number of frames known to be in the videos."""
         return sum(video.written for video in self._videos)

@@ -97,7 +97,7 @@ class Recorder(ObserverThread):
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
         writer = self._flight.writer
-        failure = self.failure or writer.video_failure
+        failure = self.failure or writer.images_failure
         if failure is None and not self.dropped:
             counted = f"{writer.ticks} ticks and {writer.frames_written} frames"
             return f"recorded {counted} in {self._folder}"
@@ -141,10 +141,10 @@ class _FlightConsumer:
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1
-        had_failed = self.writer.video_failure is not None
+        told = self.writer.images_failure
         self.writer.frame(vision)
-        failure = self.writer.video_failure
-        if failure is not None and not had_failed:
+        failure = self.writer.images_failure
+        if failure not in (None, told):
             self.report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:

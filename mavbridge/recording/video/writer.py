@@ -80,6 +80,8 @@ class VideoWriter:
         self._pending_drops = 0
         self._notices: set[Notice] = set()
         self._offered = 0
+        self.misfit: str | None = None
+        """Why a frame was dropped that the video cannot have; None if there was none."""
         self.written = 0
         """Number of frames known to be in the file."""
         niceness = NICENESS if pressure == "online" else 0
@@ -108,8 +110,8 @@ class VideoWriter:
     def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
         """Hand a frame over; the caller can overwrite it afterwards.
 
-        A frame that differs in size or kind from the first is a bug offline; online, it is dropped
-        and counted.
+        A frame that differs in size or kind from the first, or is one pixel high or wide, is a bug
+        offline; online, it is dropped and counted: see ``misfit``.
 
         Args:
             rgb: the image. An odd last row or column is cut off, which H.264 cannot have.
@@ -122,13 +124,13 @@ class VideoWriter:
         self._receive()
         height, width = rgb.shape[:2]
         rgb = rgb[: height // 2 * 2, : width // 2 * 2]
-        ring = self._ring or self._open(rgb)
-        is_same_size = rgb.shape == ring.shape.frame.shape
-        if self._pressure == "offline":
-            if not is_same_size:
-                raise ValueError(f"a frame of {rgb.shape} in a video of {self.size}")
+        ring = self._ring or (self._open(rgb) if rgb.size else None)
+        if ring is None or rgb.shape != ring.shape.frame.shape:
+            self._see_misfit(height, width)
+            ring = None
+        elif self._pressure == "offline":
             self._wait_until(lambda: bool(self._free))
-        if not (self._free and is_same_size):
+        if ring is None or not self._free:
             self._pending_drops += 1 + row.dropped_before
             return False
         slot = self._free.popleft()
@@ -136,6 +138,16 @@ class VideoWriter:
         dropped, self._pending_drops = row.dropped_before + self._pending_drops, 0
         self._send(Submit(slot, replace(row, dropped_before=dropped)))
         return True
+
+    def _see_misfit(self, height: int, width: int) -> None:
+        if self.size is None:
+            what = f"the camera's images of {width}x{height} are too small for a video"
+        else:
+            before = f"{self.size[1]}x{self.size[0]}"
+            what = f"the camera's images have changed from {before} to {width}x{height}"
+        if self._pressure == "offline":
+            raise ValueError(what)
+        self.misfit = self.misfit or what
 
     def _open(self, rgb: CameraImage) -> FrameRing:
         height, width = rgb.shape[:2]

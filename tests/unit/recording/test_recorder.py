@@ -2,8 +2,10 @@ import multiprocessing
 import os
 import resource
 import signal
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from helpers.factories import make_tick
@@ -65,6 +67,30 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
     assert len(list(back.images())) == back.frames.num_rows
     assert 10 <= stood.recorder.dropped <= 20
     assert "not completely: the writer process has died" in stood.recorder.summary()
+
+
+@pytest.mark.parametrize(
+    ("shapes", "told", "recorded"),
+    [
+        ([(48, 64, 3)] * 3 + [(96, 128, 3)] * 3, "images have changed from 64x48 to 128x96", 3),
+        ([(1, 64, 3)] * 3, "images of 64x1 are too small for a video", 0),
+        ([(64, 1, 3)] * 2 + [(48, 64, 3)], "images of 1x64 are too small for a video", 1),
+    ],
+)
+def test_images_that_no_video_can_have_are_told_once_and_cost_themselves_alone(
+    tmp_path: Path, shapes: list[tuple[int, ...]], told: str, recorded: int
+) -> None:
+    with RecorderStand(tmp_path) as stood:
+        stood.emit(range(10), range(0))
+        for number, shape in enumerate(shapes):
+            frame = replace(make_frame(number), rgb=np.full(shape, 9, np.uint8))
+            stood.recorder.emit(frame)
+    assert stood.told == [
+        f"recording no more images: the camera's {told}; the rest is still recorded"
+    ]
+    assert stood.recorder.summary().endswith(f"not completely: the camera's {told}")
+    meta = open_flight(tmp_path).meta
+    assert (meta.finished, meta.ticks, meta.frames) == (True, 10, recorded)
 
 
 def test_a_full_disk_ends_the_recording_with_one_warning(
