@@ -36,6 +36,8 @@ FIRST_NS, SILENT_NS = 10 * NS_PER_S, 2 * NS_PER_S
 """Longest wait for the first byte, and for each later one."""
 END_S = 1.0
 """Time for the program to end by itself before it is killed, and then to end after the kill."""
+_END_LOOKS = 100
+"""Checks within END_S whether it has ended."""
 _POLL_S = 0.1
 _READ_BYTES = 1 << 16
 """Capacity of a pipe. A full pipe blocks the program, so no frame in it is old."""
@@ -176,14 +178,14 @@ class PipeSource:
 
     def close(self) -> None:
         """End the program and its children, and wait for it."""
-        for number in (signal.SIGTERM, signal.SIGKILL):
-            with suppress(ProcessLookupError, PermissionError):
+        with suppress(ProcessLookupError, PermissionError):  # when no process of the group is left
+            for number in (signal.SIGTERM, *[0] * _END_LOOKS, signal.SIGKILL):
                 os.killpg(self._process.pid, number)
-            try:
-                self._process.wait(END_S)
-            except subprocess.TimeoutExpired:
-                continue
-            break
+                look_ns = self._clock.now_ns() + round(END_S * NS_PER_S / _END_LOOKS)
+                self._clock.sleep_until_ns(look_ns)
+                self._process.poll()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_S)
         for stream in (self._process.stdout, self._process.stderr):
             if stream is not None:
                 stream.close()

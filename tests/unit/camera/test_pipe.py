@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from faults.processes import child_of
+from faults.processes import Process, child_of
 from helpers.camera_senders import SIDE, depth_scene, encoded, next_image, scene
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
@@ -162,7 +162,17 @@ def test_garbage_ends_in_a_clear_error(data: bytes) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-@pytest.mark.parametrize("setup", ["", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"])
+@pytest.mark.parametrize(
+    "setup",
+    [
+        "",
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)",
+        "import subprocess\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "subprocess.Popen(['sleep', '60'])\n"  # it ignores the signal, too
+        "signal.signal(signal.SIGTERM, signal.SIG_DFL)",
+    ],
+)
 def test_frames_come_from_a_program_which_ends_with_the_camera(tmp_path: Path, setup: str) -> None:
     file = tmp_path / f"{len(setup)}.jpg"
     file.write_bytes(encoded(picture(40)))
@@ -175,7 +185,9 @@ def test_frames_come_from_a_program_which_ends_with_the_camera(tmp_path: Path, s
         assert abs(int(frame.rgb[8, 24, 1]) - 40) < 6
         assert frame.captured_ns <= clock.now_ns() - 20 * NS_PER_MS
         pid = child_of(os.getpid(), bytes(file))
+        child = Process(child_of(pid, b"sleep"), clock) if "sleep'" in setup else None
     assert not Path(f"/proc/{pid}").exists()
+    assert child is None or child.has_ended(5)
 
 
 def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
