@@ -155,43 +155,6 @@ def test_thrust_that_is_no_hover_is_not_learnt(why: str) -> None:
 
 
 @BOTH
-def test_rates_leave_as_rates_and_their_neutral_as_an_attitude(profile: Profile) -> None:
-    flight = attitude_flight(profile, is_rates=True)
-    encoded = flight.send(BodyRates(0.39, 0.5, -0.25, 0.1))
-    message: Any = flight.message(encoded)
-    assert message.type_mask == 128
-    rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-    assert rates == pytest.approx((0.5, -0.25, 0.1), abs=0.003)
-    assert encoded.action == pytest.approx(BodyRates(0.39, 0.5, -0.25, 0.1), abs=0.003)
-    message = flight.message(flight.send(LEVEL))
-    assert message.type_mask == 7
-    for _ in range(30):  # not dithered: the motors stay idle
-        message = flight.message(flight.send(LEVEL._replace(thrust=0.0)))
-        assert message.thrust == 0.0
-
-
-@BOTH
-@pytest.mark.parametrize("is_rates", [False, True])
-def test_the_echo_of_our_setpoints_confirms_them(profile: Profile, is_rates: bool) -> None:
-    flight = attitude_flight(profile, is_rates=is_rates)
-    action = BodyRates(0.39, 0.2, 0.0, 0.1) if is_rates else LEVEL
-    shown = target(0.41, (0.3, 0.2, 0.1))
-    for k in range(200):
-        message: Any = flight.message(flight.send(action))
-        if k == 10:
-            assert not flight.output.echo_confirmed
-        if k > 10:
-            rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-            # ArduPilot's rates are shaped; PX4's thrust is of an older attitude.
-            is_px4 = profile is PX4 and is_rates
-            shown = target(0.2 if is_px4 else message.thrust, rates if is_px4 else (9, 9, 9))
-        flight.receive(shown)
-        assert flight.problem is None
-    assert flight.output.echo_confirmed
-    assert flight.output.was_confirmed
-
-
-@BOTH
 def test_a_new_mode_that_is_not_told_yet_is_no_other_station(profile: Profile) -> None:
     flight = attitude_flight(profile)
     for k in range(55):  # the mode is told 30 ms after its first target
@@ -220,17 +183,6 @@ def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
 
 
 # --- velocity
-
-
-def test_while_the_climb_from_the_ground_is_brought_in_another_velocity_is_shown() -> None:
-    flight = velocity_flight(PX4)
-    for k in range(500):  # every 11 ms
-        flight.vehicle.is_landed = k < 50
-        message: Any = flight.message(flight.send(Velocity(0.0, 0.0, -1.5, 0.0)))
-        ramp_mps = max(message.vz, 2.2 - 2 * 0.011 * k)
-        flight.receive(VelocityTarget(7, (0.0, 0.0, ramp_mps)))
-        assert flight.problem is None
-    assert flight.output.echo.confirmed
 
 
 @BOTH
