@@ -48,8 +48,7 @@ from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection
-from mavbridge.mavlink.transport.sockets import Address, Transport
+from mavbridge.mavlink.transport.connection import REFUSED_NS, Address, Connection, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from mavbridge.mavlink.transport.sockets import Address, Received, Transport
+from mavbridge.mavlink.transport.connection import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
 
 VEHICLE: Address = ("sitl", 1)

@@ -25,7 +25,7 @@ from mavbridge.core.vehicle import ActionKind
 from mavbridge.guard.memory import ACT_TIMEOUT_NS
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardTick
-from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.mavlink.transport.connection import Address, Received
 from mavbridge.simulation.network import VEHICLE
 from sitl.vehicle.config import AutopilotName
 

@@ -28,7 +28,7 @@ from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.mavlink.transport.connection import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process
 from mavbridge.simulation.network import DelayedChannel

@@ -35,8 +35,7 @@ from mavbridge.mavlink.outputs.output import ActionOutput
 from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
-from mavbridge.mavlink.transport.connection import Connection
-from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.mavlink.transport.connection import Address, Connection, Received
 
 MS = NS_PER_MS
 STEP_NS, SHOWN_NS = 10 * MS, 20 * MS

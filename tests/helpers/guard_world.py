@@ -9,7 +9,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FeatureFrame, Frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.guard.wire import FromGuard, decode_from_guard
-from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
+from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.guard import MemoryPort
 from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport

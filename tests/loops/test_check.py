@@ -12,7 +12,7 @@ from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.flight.plan import plan_flight
-from mavbridge.mavlink.transport.sockets import Address
+from mavbridge.mavlink.transport.connection import Address
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper

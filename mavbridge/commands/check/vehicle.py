@@ -29,8 +29,9 @@ from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.mavlink.transport.connection import Transport
 from mavbridge.mavlink.transport.signing_files import SigningStore
-from mavbridge.mavlink.transport.sockets import Transport, make_transport
+from mavbridge.mavlink.transport.sockets import make_transport
 from policy.contract import Contract
 
 SET_UP_S = 15.0

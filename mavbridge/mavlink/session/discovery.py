@@ -16,7 +16,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
-from mavbridge.mavlink.transport.sockets import Address
+from mavbridge.mavlink.transport.connection import Address
 
 AUTOPILOT_COMPONENT = 1
 SETTLE_NS = 3 * NS_PER_S // 2

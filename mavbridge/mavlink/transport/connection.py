@@ -1,8 +1,9 @@
 """Transport combined with the codec: receives messages, sends packets, reconnects by itself."""
 
 from collections.abc import Iterator
-from typing import TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
+from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because
@@ -12,7 +13,6 @@ from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.readers import UNKNOWN
 from mavbridge.mavlink.codec.signing import Refusal
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDownError
 
 REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
@@ -34,6 +34,52 @@ REFUSALS: dict[Refusal, str] = {
     "than a minute ago: its clock is behind (a vehicle has the time from GPS, or from the tool "
     "that gave it its key), ours is ahead, or they are replayed",
 }
+
+
+Address: TypeAlias = SocketAddress
+
+
+class Received(NamedTuple):
+    """Received bytes and their arrival."""
+
+    data: bytes
+    arrived_ns: int
+    sender: Address | None
+    """Source of a datagram; None on a stream, which has a single peer."""
+
+
+class TransportDownError(Exception):
+    """The peer or the port is gone; reopening may help."""
+
+
+class Transport(Protocol):
+    """Non-blocking connection to a vehicle; not thread-safe."""
+
+    def open(self) -> None:
+        """Open the socket or port; raise UserError, or TransportDownError if a retry may help."""
+        return
+
+    def drain(self) -> Iterator[Received]:
+        """Yield everything that has arrived. Raise TransportDownError if the connection is lost."""
+
+    def fileno(self) -> int | None:
+        """Return the descriptor that is readable when ``drain`` has data; None if closed."""
+        return None
+
+    def receiver(self, peer: Address | None) -> Address | None:
+        """Return the destination of ``send``; None on a stream, or if there is none yet."""
+        return None
+
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
+        """Hand one whole packet to the kernel; return False if it had to be dropped.
+
+        ``peer``: destination of a datagram if we listen, else ignored. Raise TransportDownError if
+        the connection is lost.
+        """
+
+    def close(self) -> None:
+        """Close the socket or port; safe to call twice."""
+        return
 
 
 Arrival: TypeAlias = tuple[ReceivedMessage, int, Address | None]

@@ -13,14 +13,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Generic, TypeVar
 
 import serial
 from serial.tools import list_ports
 
 from mavbridge.core.address import (
     SerialAddress,
-    SocketAddress,
     TcpAddress,
     UdpAddress,
     family,
@@ -30,8 +29,12 @@ from mavbridge.core.address import (
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import PeerError, UserError
-
-Address: TypeAlias = SocketAddress
+from mavbridge.mavlink.transport.connection import (
+    Address,
+    Received,
+    Transport,
+    TransportDownError,
+)
 
 TCP_SILENCE_NS = 5 * NS_PER_S
 """Silence that means a dead connection, known to the kernel or not: heartbeats come at 1 Hz."""
@@ -55,49 +58,6 @@ _SO_TIMESTAMPNS = 35
 """From asm-generic/socket.h; Python's socket module lacks it."""
 _TIMESPEC = struct.Struct("@qq")
 _HOLDER = "stop the program that has it, or wait if that is a guard still giving sticks back"
-
-
-class Received(NamedTuple):
-    """Received bytes and their arrival."""
-
-    data: bytes
-    arrived_ns: int
-    sender: Address | None
-    """Source of a datagram; None on a stream, which has a single peer."""
-
-
-class TransportDownError(Exception):
-    """The peer or the port is gone; reopening may help."""
-
-
-class Transport(Protocol):
-    """Non-blocking connection to a vehicle; not thread-safe."""
-
-    def open(self) -> None:
-        """Open the socket or port; raise UserError, or TransportDownError if a retry may help."""
-        return
-
-    def drain(self) -> Iterator[Received]:
-        """Yield everything that has arrived. Raise TransportDownError if the connection is lost."""
-
-    def fileno(self) -> int | None:
-        """Return the descriptor that is readable when ``drain`` has data; None if closed."""
-        return None
-
-    def receiver(self, peer: Address | None) -> Address | None:
-        """Return the destination of ``send``; None on a stream, or if there is none yet."""
-        return None
-
-    def send(self, data: bytes, peer: Address | None = None) -> bool:
-        """Hand one whole packet to the kernel; return False if it had to be dropped.
-
-        ``peer``: destination of a datagram if we listen, else ignored. Raise TransportDownError if
-        the connection is lost.
-        """
-
-    def close(self) -> None:
-        """Close the socket or port; safe to call twice."""
-        return
 
 
 _Handle = TypeVar("_Handle", socket.socket, serial.Serial)

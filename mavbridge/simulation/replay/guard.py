@@ -28,7 +28,7 @@ from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.sockets import Address, Received, Transport
+from mavbridge.mavlink.transport.connection import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource

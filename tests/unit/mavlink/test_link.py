@@ -25,7 +25,7 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
+from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
 
 MS = NS_PER_MS
 PARAMS = CALIBRATION | {

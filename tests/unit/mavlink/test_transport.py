@@ -20,13 +20,8 @@ from mavbridge.core.address import spelled
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import free_port
-from mavbridge.mavlink.transport.sockets import (
-    TCP_SILENCE_NS,
-    SerialTransport,
-    Transport,
-    TransportDownError,
-    make_transport,
-)
+from mavbridge.mavlink.transport.connection import Transport, TransportDownError
+from mavbridge.mavlink.transport.sockets import TCP_SILENCE_NS, SerialTransport, make_transport
 
 Stream = tuple[Transport, Callable[[bytes], object], Callable[[int], bytes]]
 """Our end of a stream, and the vehicle's ways to write and to read."""
