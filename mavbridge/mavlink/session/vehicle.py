@@ -81,7 +81,7 @@ class TextJoiner:
     """Joins the pieces of one text as they arrive; a missing piece becomes dots."""
 
     def __init__(self) -> None:
-        self._text_id = 0
+        self._text_id = self._ended_id = 0
         self._pieces: list[str] = []
         self._since_ns = 0
 
@@ -89,6 +89,8 @@ class TextJoiner:
         """Add a piece; return the texts that are complete, or will not become so."""
         if body.text_id == 0:
             return [body.text.rstrip()]
+        if body.text_id == self._ended_id:  # a piece that came twice, or too late
+            return []
         texts = [] if body.text_id == self._text_id else self._end()
         if not self._pieces:
             self._text_id, self._since_ns = body.text_id, now_ns
@@ -104,7 +106,7 @@ class TextJoiner:
 
     def _end(self, *, is_whole: bool = False) -> list[str]:
         text = "".join(self._pieces)
-        self._pieces = []
+        self._pieces, self._ended_id = [], self._text_id
         return [(text if is_whole else text + _GAP).rstrip()] if text else []
 
 
