@@ -115,6 +115,8 @@ class Connection:
         which have none to test."""
         self._told_signatures = 0
         """Number of kinds of rejected signatures that were reported."""
+        self._told_loss = ""
+        """Last report of a lost connection; empty once bytes have come again."""
         self._opened = 0
         self._open(clock.now_ns())
 
@@ -162,18 +164,22 @@ class Connection:
     def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + REOPEN_NS
-        self.report(f"connection lost ({error}); reconnecting")
+        text = f"connection lost ({error}); reconnecting"
+        if text != self._told_loss:
+            self._told_loss = text
+            self.report(text)
 
     def receive(self) -> Iterator[Arrival]:
         """Yield the messages that have arrived; reopen the transport when that is due."""
         now_ns = self._clock.now_ns()
-        if self._reopen_ns is not None:
-            if now_ns < self._reopen_ns:
-                return
+        if self._reopen_ns is not None and now_ns >= self._reopen_ns:
             self._open(now_ns)
+        if self.is_down:
+            return
         try:
             for data, arrived_ns, sender in self._transport.drain():
                 self.received_bytes += len(data)
+                self._told_loss = ""
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
