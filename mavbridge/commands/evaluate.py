@@ -82,20 +82,18 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         EpisodeInterruptedError: ``should_stop`` ended it.
         MavbridgeError: it cannot be flown.
     """
-    config, delays = spec.config, Delays()
-    vision = delays.vision
-    if config.vision_time is not None:
-        vision = Delay(p50_ns=round(config.vision_time * NS_PER_MS))
-    vision = replace(vision, offset_ns=round(config.vision_delay * NS_PER_MS))
-    action = delays.action
-    if config.solve_time is not None:
-        action = Delay(p50_ns=round(config.solve_time * NS_PER_MS))
-    stall_ns = round(config.stalls * NS_PER_MS)
+    config, usual = spec.config, Delays()
+    vision = _delay(usual.vision, config.vision_time)
+    delays = replace(
+        usual,
+        vision=replace(vision, offset_ns=round(config.vision_delay * NS_PER_MS)),
+        action=_delay(usual.action, config.solve_time),
+        stall_ns=round(config.stalls * NS_PER_MS),
+    )
     settings = SimulationSettings(
         rates=config.rates,
         limits=config.limits,
-        delays=replace(delays, vision=vision, action=action, stall_ns=stall_ns),
-        raw_sticks=config.raw_sticks,
+        delays=delays,
         draw_images=not is_scripted(config.policy),
     )
     conditions = draw_conditions(config.conditions, spec.course_seed)
@@ -121,6 +119,10 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
             runner, max_time_s=config.max_time, run_out_s=config.hover, should_stop=should_stop
         )
     return FlownEpisode(engine=loaded.runner.engine, notes=tuple(loaded.notes), result=result)
+
+
+def _delay(usual: Delay, asked_ms: float | None) -> Delay:
+    return usual if asked_ms is None else Delay(p50_ns=round(asked_ms * NS_PER_MS))
 
 
 def identity(config: EvaluateConfig) -> str:

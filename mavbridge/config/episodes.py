@@ -83,8 +83,6 @@ class EvaluateConfig(Ranged):
     gusts: Annotated[float | None, Between(0, 10, "m/s")] = None
     """Standard deviation of horizontal gusts, in m/s. Each axis has its own; they replace those of
     --conditions."""
-    raw_sticks: bool = False
-    """Send the policy's sticks as they are, without the inverse of the vehicle's curves."""
     vision_delay: Annotated[float, Between(0, 5000, "ms")] = 0.0
     """Milliseconds added to the encoding of each image; an image older than
     limits.feature_age is not flown by. Here such limits may also be looser than the policy's."""

@@ -27,7 +27,6 @@ from mavbridge.config.episodes import (
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code
-from mavbridge.flight.policies import is_stateless
 
 CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
 
@@ -111,9 +110,3 @@ def test_ctrl_c_ends_with_the_results_so_far(
     assert shown.err.count("mind the gap") == 1
     assert "images 50 ms later" in shown.out
     assert "2 flights: 1 finished, 1 crashed" in shown.out
-
-
-def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
-    assert is_stateless(PolicyConfig(policy="toge:small"))
-    assert not is_stateless(CIRCLE)
-    assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
