@@ -11,6 +11,7 @@ from base64 import b64encode
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from heapq import merge
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -89,25 +90,34 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
     above, count = Path(os.path.commonpath([folder.parent for folder in folders])), 0
     with whole_or_nothing(config.out) as out:
         for folder in folders:
-            flight, name = open_flight(folder), "-".join(folder.relative_to(above).parts)
-            print_warnings(console, flight.damage)
-            count += write_flight(flight, out / f"{name}.mcap")
+            cameras, name = _cameras(folder), "-".join(folder.relative_to(above).parts)
+            print_warnings(console, dict.fromkeys(chain(*(each.damage for each in cameras))))
+            count += write_flight(cameras, out / f"{name}.mcap")
     text = f"{config.out}: {len(folders)} flights, {count} messages"
     text_console().print(text, soft_wrap=True)
     return 0
 
 
-def write_flight(flight: RecordedFlight, path: Path) -> int:
+def _cameras(folder: Path) -> list[RecordedFlight]:
+    """Open a flight with each of its cameras, in the contract's order."""
+    first = open_flight(folder)
+    names = () if first.meta.contract is None else first.meta.contract.cameras[1:]
+    return [first, *(open_flight(folder, name) for name in names)]
+
+
+def write_flight(cameras: Sequence[RecordedFlight], path: Path) -> int:
     """Write a flight to a new file, a row and an image at a time; return the number of messages.
 
+    ``cameras``: the flight with each of its cameras.
+
     Raises:
-        MavbridgeError: another camera's files or a video are damaged.
+        MavbridgeError: a video is damaged.
         OSError: the file cannot be written.
     """
+    flight = cameras[0]
     contract = flight.meta.contract or Contract()
     offset_ns, known = unix_offset_ns(flight.meta), schemas(contract.action)
-    others = [open_flight(flight.folder, camera) for camera in contract.cameras[1:]]
-    videos = zip(contract.cameras, (flight, *others), strict=True)
+    videos = zip(contract.cameras, cameras, strict=True)
     streams = [_ticks(flight, contract.state_frame), *(_images(*each) for each in videos)]
     channels: dict[str, int] = {}
     count = 0

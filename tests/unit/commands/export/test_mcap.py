@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from helpers.factories import START_NS, TICK_NS, make_released_tick, make_state, make_tick
 from helpers.guides import ROOT
 from helpers.recordings import make_frame, make_meta, number_of, write_recording
-from helpers.status import status_of
+from helpers.status import status_of, told_by
 from mavbridge.core.records import Position, Tick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import open_flight
@@ -255,6 +255,10 @@ def test_every_camera_has_a_topic(tmp_path: Path) -> None:
     copy(folder / "frames.parquet", folder / "frames_down.parquet")
     file = exported(folder, tmp_path / "out")
     assert len(file.of("/camera/front")) == len(file.of("/camera/down")) == FRAMES
+    (folder / "camera_down.mp4").write_bytes((folder / "camera.mp4").read_bytes()[:-3000])
+    _, text = told_by("export", folder, "--out", tmp_path / "cut", "--format", "mcap")
+    assert "warning: " in text
+    assert "camera_down.mp4" in text
 
 
 def test_without_a_wall_time_the_stamps_are_monotonic(tmp_path: Path) -> None:
