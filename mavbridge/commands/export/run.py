@@ -256,13 +256,12 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise UserError(f"--out {out} is there and not empty: name a new folder")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
-    except FileExistsError as error:
-        raise UserError(
-            f"{part} is left of an export that was killed, or another one is at work there: "
-            "remove it, or name another --out"
-        ) from error
+        if part.exists():
+            raise UserError(
+                f"{part} is left of an export that was killed, or another one is at work there: "
+                "remove it, or name another --out"
+            )
+        part.mkdir(parents=True)
     except OSError as error:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
     terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)

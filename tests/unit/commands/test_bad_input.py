@@ -53,6 +53,7 @@ BAD = [
     ("export spots --out foreigners", "not empty"),
     ("export spots --out left", "was killed"),
     ("export spots --out .", "name a new folder"),
+    ("export spots --out taken.mp4/new", "--out taken.mp4/new cannot be written"),
     ("export spots --out new --image-size 0", "--image-size"),
     ("export spots --out new --image-size 97", "--image-size"),
     ("export spots --out new --image-size 5000", "--image-size"),
