@@ -182,13 +182,10 @@ def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
         command = ("-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}", "--camera", shared)
         log = folder / "vehicle.log"
         vehicle = stack.enter_context(running(sys.executable, *command, log=log))
-        flight = FlyConfig(
-            policy=config.policy, rates=config.rates, goal=config.goal, duration=duration_s
-        )
         source = NO_CAMERA if set(config.camera.sources) == {NO_CAMERA} else shared
-        flight = climb_config(flight, runner.contract, port=port, source=source)
+        flight = climb_config(config, runner.contract, port=port, source=source)
         try:
-            meter = fly_and_measure(flight, runner, clock)
+            meter = fly_and_measure(replace(flight, duration=duration_s), runner, clock)
         except MavbridgeError as error:
             if vehicle.poll() is None:
                 raise
@@ -199,12 +196,14 @@ def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
 
 
 def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: str) -> FlyConfig:
-    """Return ``config`` for a ``level_climb`` at a bundled vehicle, with one source of images for
-    all cameras of the policy."""
+    """Return the flight of a ``level_climb`` at a bundled vehicle, by the policy of ``config``; all
+    its cameras see the same ``source``."""
     names = contract.cameras
     sources = (source,) if len(names) == 1 else tuple(f"{name}={source}" for name in names)
-    return replace(
-        config,
+    return FlyConfig(
+        policy=config.policy,
+        rates=config.rates,
+        goal=config.goal,
         link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
         # High above the course, the simulator's noiseless view hardly changes.
         camera=CameraConfig(camera=sources, max_frozen_image=0.0),

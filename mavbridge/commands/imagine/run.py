@@ -38,7 +38,6 @@ from policy.checkpoints.networks import load_world_model
 from policy.engines.runner import require_device
 from policy.errors import Warned
 from policy.nets.world_model.config import WorldModelConfig
-from policy.nets.world_model.model import WorldModel
 from policy.preprocess import resize
 
 MAX_STATE_AGE_NS = 100_000_000
@@ -59,9 +58,10 @@ def imagine(config: ImagineConfig) -> int:
     prepare_out(config.out)
     flight = open_flight(config.start)
     print_warnings(console, flight.damage)
-    model = load_model(
-        config.world_model, ddim_steps=config.ddim_steps, device=config.policy.device
-    )
+    require_device(config.policy.device)
+    model = load_world_model(config.world_model or SHIPPED)
+    model.config.schedule.ddim_steps(config.ddim_steps)  # raises if that number is not possible
+    model = model.to(torch.device(config.policy.device)).eval()
     if plan.frames > model.config.frames:
         flag = "--frames" if config.frames else "--exe-steps"
         raise UserError(
@@ -133,18 +133,6 @@ def run_rollout(
     except BaseException:
         output.close()
         raise
-
-
-def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:
-    """Load a world model onto a torch device; default: the one shipped with mavbridge.
-
-    Raises:
-        PolicyError: no such device, or the weights cannot be used, or not with so many steps.
-    """
-    require_device(device)
-    model = load_world_model(world_model or SHIPPED)
-    model.config.schedule.ddim_steps(ddim_steps)  # raises if that number is not possible
-    return model.to(torch.device(device)).eval()
 
 
 def _make_decider(
