@@ -132,39 +132,30 @@ def test_each_side_has_its_gain_in_gusts_too_and_if_it_settles_late(
         assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + lag_s, abs=0.04), push
 
 
-def test_what_the_policy_did_not_fly_is_missing_with_its_reason() -> None:
-    yaw = next(step for step in doublet_steps("sticks") if step.axis == "yaw")
-    recording = recorded(is_flown=lambda time_s: time_s < yaw.begin_s + 1.0)
+def test_what_could_not_be_measured_is_told_beside_every_figure() -> None:
+    def deaf(axis: str, stick: float) -> float:
+        return 0.0 if axis == "yaw" else usual_sticks(axis, stick)
+
+    climb = next(step for step in doublet_steps("sticks") if step.axis == "climb")
+    recording = recorded(curve=deaf, is_flown=lambda time_s: time_s < climb.begin_s + 1.0)
     found = identified(recording)
-    assert {push.axis for push in found.pushes} == {"roll", "pitch"}
-    assert found.missing[0] == "yaw at 50%: the policy did not fly all of it"
-    assert len(found.missing) == 4
+    reasons = ("the motion does not follow the action", "the policy did not fly all of it")
+    assert found.missing == (
+        *(f"yaw at {share}%: {reasons[0]}" for share in (50, 100)),
+        *(f"climb at {share}%: {reasons[1]}" for share in (60, 100)),
+    )
     console = Console(file=StringIO(), width=120)
     print_identification(found, Contract(), console)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "not measured: climb at 100%" in text
     assert "+8.1" in text
-
-
-def test_a_vehicle_that_does_not_follow_is_not_measured() -> None:
-    def deaf(axis: str, stick: float) -> float:
-        return 0.0 if axis == "yaw" else usual_sticks(axis, stick)
-
-    found = identified(recorded(curve=deaf))
-    assert "yaw at 100%: the motion does not follow the action" in found.missing
-
-
-def test_json_holds_every_figure() -> None:
-    found = identified(recorded())
     document = json.loads(to_json(found, Contract(), IdentifyConfig()))
-    assert len(document["pushes"]) == 8
+    assert [push["axis"] for push in document["pushes"]] == ["roll", "roll", "pitch", "pitch"]
     first = document["pushes"][0]
     assert first["measured"][0] == pytest.approx(8.1, abs=0.2)
     assert first["ratio"] == pytest.approx([1.0, 1.0], abs=0.02)
-    assert (document["policy"], document["action"], document["hover_thrust"]) == (
-        *("toge", "sticks"),
-        None,
-    )
+    assert (document["policy"], document["action"]) == ("toge", "sticks")
+    assert (document["hover_thrust"], len(document["missing"])) == (None, 4)
 
 
 # --- the flight
