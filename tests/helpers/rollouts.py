@@ -108,7 +108,7 @@ def make_decider(name: str, sampler: Sampler) -> Decider:
 
 
 def make_sampler(model: WorldModel | None = None) -> Sampler:
-    return Sampler(model or TinyWorld(), ddim_steps=1, clock=MonotonicClock())
+    return Sampler(model or TinyWorld(), ddim_steps=1)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,10 @@ def run(
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model)
-    output = StreamedOutput(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
+    clock = MonotonicClock()
+    output = StreamedOutput(
+        out, sampler, plan, clock=clock, decode_video=decode_video, on_frame=on_frame
+    )
     try:
         for segment in segments(sampler, plan, decider):
             output.put(segment)

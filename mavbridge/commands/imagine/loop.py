@@ -5,14 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal, Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
@@ -22,7 +22,6 @@ from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner
 
-Part: TypeAlias = Literal["sample", "decode", "write"]
 SAMPLES_PER_STEP = 8
 """Samples whose mean is one action of the world model, the mean stick of a step."""
 MAX_SEED = 2**63 - 1
@@ -47,25 +46,13 @@ def torch_threads(count: int) -> Iterator[None]:
 class Sampler:
     """One world model in both roles, simulation and decision. Used by the loop's thread."""
 
-    def __init__(self, model: WorldModel, *, ddim_steps: int, clock: Clock) -> None:
+    def __init__(self, model: WorldModel, *, ddim_steps: int) -> None:
         """Wrap a model that is already on its device."""
         self.model = model
         self.config: WorldModelConfig = model.config
-        self.clock = clock
-        self.seconds: dict[Part, float] = {"sample": 0.0, "decode": 0.0, "write": 0.0}
-        """Time of the loop's thread; decode: waits for room in the decoder's queue included."""
         self.frames_decoded = 0
         self._ddim_steps = ddim_steps
         self._device = next(model.parameters()).device
-
-    @contextmanager
-    def timed(self, part: Part) -> Iterator[None]:
-        """Context manager: add the block's time."""
-        begun_ns = self.clock.now_ns()
-        try:
-            yield
-        finally:
-            self.seconds[part] += (self.clock.now_ns() - begun_ns) / NS_PER_S
 
     def encode(self, images: NDArray[np.uint8]) -> Tensor:
         """Encode images [N, H, W, 3] to latents [N, C, h, w]."""
@@ -77,7 +64,7 @@ class Sampler:
 
         On one thread, like the decoder's, because splitting a sum changes its rounding.
         """
-        with torch.inference_mode(), torch_threads(1), self.timed("decode"):
+        with torch.inference_mode(), torch_threads(1):
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
         self.frames_decoded += len(pixels)
         return pixels
@@ -95,7 +82,7 @@ class Sampler:
         Raises:
             RolloutError: the result is not finite.
         """
-        with torch.inference_mode(), self.timed("sample"):
+        with torch.inference_mode():
             imagined = self.model.sample(
                 latents,
                 self._tensor(states),

@@ -24,7 +24,7 @@ from mavbridge.commands.imagine.loop import (
     Segment,
     torch_threads,
 )
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
@@ -103,13 +103,15 @@ class StreamedOutput:
         sampler: Sampler,
         plan: RolloutPlan,
         *,
+        clock: Clock,
         decode_video: bool = True,
         on_frame: OnFrame | None = None,
     ) -> None:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
-        self._sampler = sampler
+        self._model = sampler.model
+        self._clock = clock
         self._frame_dt_s = sampler.config.frame_dt_s
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
@@ -149,8 +151,7 @@ class StreamedOutput:
         ready = None
         if self.video is not None and segment.latents.is_cuda:
             ready = torch.cuda.current_stream(segment.latents.device).record_event()
-        with self._sampler.timed("decode"):
-            self._enqueue((segment, ready))
+        self._enqueue((segment, ready))
 
     def _enqueue(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
         def was_put() -> bool:
@@ -167,29 +168,27 @@ class StreamedOutput:
 
     def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """Wait for the condition, which itself waits briefly, as long as frames are finished."""
-        seen, since_ns = self.frames, self._sampler.clock.now_ns()
+        seen, since_ns = self.frames, self._clock.now_ns()
         while not condition():
             on_wait()
             if self.frames != seen:
-                seen, since_ns = self.frames, self._sampler.clock.now_ns()
-            elif self._sampler.clock.now_ns() - since_ns > STALL_S * NS_PER_S:
+                seen, since_ns = self.frames, self._clock.now_ns()
+            elif self._clock.now_ns() - since_ns > STALL_S * NS_PER_S:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Process the queue, close the files, and compare their lengths."""
-        with self._sampler.timed("decode"):
-            self._enqueue(None, on_wait)
-            self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
-            self._worker.join(END_S)
-        with self._sampler.timed("write"):
-            if self.video is not None:
-                self.video.finish()
-                if self.video.written != self._table.rows:
-                    raise RolloutError(
-                        f"{self.video.written} frames were written for {self._table.rows} rows"
-                    )
-            with writing(self._table_path):
-                self._table.finish()
+        self._enqueue(None, on_wait)
+        self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
+        self._worker.join(END_S)
+        if self.video is not None:
+            self.video.finish()
+            if self.video.written != self._table.rows:
+                raise RolloutError(
+                    f"{self.video.written} frames were written for {self._table.rows} rows"
+                )
+        with writing(self._table_path):
+            self._table.finish()
 
     def close(self) -> None:
         """Stop the thread and the writer; the data written so far stays readable."""
@@ -246,7 +245,7 @@ class StreamedOutput:
                 row = FrameRow(
                     frame_id=frame.number,
                     captured_ns=captured_ns,
-                    ready_ns=self._sampler.clock.now_ns(),
+                    ready_ns=self._clock.now_ns(),
                 )
                 self.video.submit(rgb, row)
                 self._digest.update(np.ascontiguousarray(rgb).data)
@@ -268,6 +267,6 @@ class StreamedOutput:
         for row in rows:
             beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
             with torch.inference_mode(), beside:
-                decoded = self._sampler.model.decode(latents[row, None])[0]
+                decoded = self._model.decode(latents[row, None])[0]
                 pixels: ImageArray = decoded.cpu().numpy()
             yield pixels

@@ -69,7 +69,7 @@ def imagine(config: ImagineConfig) -> int:
             "imagines: lower it"
         )
     start = read_start(flight, model.config, config.start_at)
-    sampler = Sampler(model, ddim_steps=config.ddim_steps, clock=clock)
+    sampler = Sampler(model, ddim_steps=config.ddim_steps)
     # Leave one core for the decoder: torch's threads spin at the end of every operation until the
     # last of them is done.
     free = torch.get_num_threads() - 1
@@ -84,7 +84,12 @@ def imagine(config: ImagineConfig) -> int:
             view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
             on_frame = view.show
         output = StreamedOutput(
-            config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
+            config.out,
+            sampler,
+            plan,
+            clock=clock,
+            decode_video=config.decode_video,
+            on_frame=on_frame,
         )
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
     _print_summary(config, sampler, output)
@@ -156,16 +161,11 @@ def _make_decider(
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
     console = text_console()
-    seconds = sampler.seconds
     decoded = sampler.frames_decoded + output.frames_decoded
     what = f"{config.out}: {output.frames} frames"
     if not config.decode_video:
         what = f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"
-    console.print(
-        f"{what}, {decoded} decoded; sampling {seconds['sample']:.2f} s, waiting for pixels "
-        f"{seconds['decode']:.2f} s, for the files {seconds['write']:.2f} s",
-        soft_wrap=True,
-    )
+    console.print(f"{what}, {decoded} decoded", soft_wrap=True)
     if config.decode_video:
         console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)
 

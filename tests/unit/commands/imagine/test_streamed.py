@@ -17,6 +17,7 @@ from helpers.recordings import send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import count_frames, read_video
@@ -27,7 +28,7 @@ PLAN = make_plan(iterations=1000)
 
 @contextmanager
 def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput]:
-    made = StreamedOutput(out, make_sampler(model), PLAN)
+    made = StreamedOutput(out, make_sampler(model), PLAN, clock=MonotonicClock())
     try:
         yield made
     finally:
