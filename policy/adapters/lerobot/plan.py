@@ -39,7 +39,7 @@ _STEP = {
     "eps": float | int | None,
     "state_file": str | None,
 }
-"""Types of the entries of a processor's step that are read; None: it may be missing."""
+"""Types of the entries of a processor's step that are read; None: it may be missing or null."""
 _EPSILON = 1e-8
 _CONSTANT = 1e-6
 """A number of the state that varied by less counts as constant."""
@@ -154,12 +154,13 @@ def _processor(
         if wrong := [key for key, kind in _STEP.items() if not isinstance(entries.get(key), kind)]:
             raise CheckpointError(f"{path}: the step {name!r} has malformed entries {wrong}")
         if name == "rename_observations_processor":
-            renamed |= config.get("rename_map", {})
+            renamed |= config.get("rename_map") or {}
         elif name == normaliser:
             file, only = step.get("state_file"), config.get("normalize_observation_keys")
             arrays = _by_feature(_read_arrays(path.parent / file)) if file else {}
             kept = {k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)}
-            modes, epsilon = config.get("norm_map", {}), float(config.get("eps", _EPSILON))
+            modes, epsilon = config.get("norm_map") or {}, config.get("eps")
+            epsilon = _EPSILON if epsilon is None else float(epsilon)
             found = replace(found, modes=modes, epsilon=epsilon, arrays=kept)
         elif name not in _HARMLESS:
             raise CheckpointError(

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,16 @@ def test_a_contract_that_contradicts_the_policy_is_refused(folder, contract, sai
     (folder / "mavbridge.toml").write_text(CONTRACT + contract + "\n")
     with pytest.raises(ContractError, match=said):
         read_plan(folder, None)
+
+
+def test_entries_of_a_processor_that_are_null_are_as_missing_ones(folder):
+    def empty(data):
+        data["steps"][0]["config"] = {"rename_map": None}
+        data["steps"][3]["config"]["eps"] = None
+
+    before = read_plan(folder, None).normalisation
+    edit(folder / "policy_preprocessor.json", empty)
+    np.testing.assert_equal(asdict(read_plan(folder, None).normalisation), asdict(before))
 
 
 def test_a_renamed_camera_is_known_by_both_names(folder):
