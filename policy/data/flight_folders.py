@@ -21,7 +21,7 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.flight_video import decode_images, video_parts, with_images
-from policy.data.tables import read_rows, stamps, vectors
+from policy.data.tables import number_column, read_rows, stamps, vectors
 from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
@@ -145,8 +145,8 @@ def read_flight(folder: Path) -> FlightData:
         state_frame=contract.state_frame,
         tick_ns=tick_ns,
         state=state,
-        attitude_ns=_stamps_or(ticks, "attitude_ns", tick_ns, _known(state)),
-        velocity_ns=_stamps_or(ticks, "velocity_ns", tick_ns, _known(state)),
+        attitude_ns=_stamps_or(name, ticks, "attitude_ns", tick_ns, _known(state)),
+        velocity_ns=_stamps_or(name, ticks, "velocity_ns", tick_ns, _known(state)),
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
@@ -155,7 +155,7 @@ def read_flight(folder: Path) -> FlightData:
             contract.action, contract.hover_thrust, contract.max_tilt_deg, contract.stops_at_end
         ),
         course_seed=course_seed if isinstance(course_seed, int) else None,
-        age_ns=_ages(ticks),
+        age_ns=_ages(name, ticks),
         captured_ns=stamps(name, frames, "captured_ns"),
         gate=_gates(name, frames),
         decode=partial(decode_video, video, numbers),
@@ -170,7 +170,7 @@ def _sticks(
     sent = _sent(name, ticks, contract)
     is_expert = "expert" in ticks.column_names
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
-    is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
+    is_target = _known(target) & np.array([armed is True for armed in ticks["armed"].to_pylist()])
     is_in_mode = np.isin(ticks["mode"].to_pylist(), contract.modes)
     is_correction = is_in_mode & _corrections(meta, ticks, contract)
     if not is_expert and is_correction.any():
@@ -222,7 +222,8 @@ def _corrections(
 def read_ages(folder: Path) -> Nanoseconds:
     """Return the sorted image ages that were measured at the ticks of a flight."""
     _read_meta(folder)
-    ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
+    ticks, _ = _read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])
+    ages = _ages(str(folder), ticks)
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
@@ -289,17 +290,19 @@ def _read_table(
 
 
 def _stamps_or(
-    table: pa.Table, name: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
+    name: str, table: pa.Table, column: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
 ) -> Nanoseconds:
     """Return the stamps of the rows to ``use``; other rows, never read, get ``otherwise``."""
-    rows = zip(table[name].to_pylist(), otherwise.tolist(), use, strict=True)
-    return np.array([a if is_used and a is not None else b for a, b, is_used in rows], np.int64)
+    is_own = use & np.asarray(table[column].is_valid())
+    out = otherwise.copy()
+    out[is_own] = stamps(name, table.filter(pa.array(is_own)), column)
+    return out
 
 
-def _ages(ticks: pa.Table) -> Nanoseconds:
+def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
     """Return the image's age at each tick that had one."""
-    pairs = zip(ticks["woke_ns"].to_pylist(), ticks["feature_captured_ns"].to_pylist(), strict=True)
-    return np.array([woke - exposed for woke, exposed in pairs if exposed is not None], np.int64)
+    looked = ticks.filter(ticks["feature_captured_ns"].is_valid())
+    return stamps(name, looked, "woke_ns") - stamps(name, looked, "feature_captured_ns")
 
 
 def _known(values: FloatArray) -> NDArray[np.bool_]:
@@ -311,8 +314,9 @@ def _gates(name: str, frames: pa.Table) -> FloatArray:
     if "gate_body_m" in frames.column_names:
         out[:, :3] = vectors(name, frames, "gate_body_m", 3)
     if "gate_yaw_rad" in frames.column_names:
-        yaw = frames["gate_yaw_rad"].to_pylist()
-        out[:, 3] = [np.nan if value is None else value for value in yaw]
+        yaw = frames["gate_yaw_rad"]
+        known = np.asarray(yaw.is_valid())
+        out[known, 3] = number_column(name, frames.filter(yaw.is_valid()), "gate_yaw_rad")
     if "gate_after_body_m" in frames.column_names:
         out[:, 4:] = vectors(name, frames, "gate_after_body_m", 3)
     return out

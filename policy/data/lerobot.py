@@ -27,7 +27,7 @@ from policy.contract import (
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
-from policy.data.tables import numbers, stamps, vectors
+from policy.data.tables import number_column, stamps, vectors
 from policy.files import library_name, read_object, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
@@ -219,7 +219,7 @@ def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
 
 
 def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
-    seconds = numbers(row.name, table, "timestamp").astype(np.float64)
+    seconds = number_column(row.name, table, "timestamp").astype(np.float64)
     if not np.isfinite(seconds).all():
         raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
     off_s = np.abs(seconds - seconds[0] - np.arange(row.length) / info.fps)
@@ -302,7 +302,7 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
                 wanted += 1
                 if wanted == row.length:
                     return
-    except (av.FFmpegError, OSError, IndexError, ZeroDivisionError) as error:
+    except (av.FFmpegError, OSError, IndexError, ArithmeticError) as error:
         raise DatasetError(why_unreadable(row.video, error)) from error
 
 

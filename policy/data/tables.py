@@ -17,10 +17,10 @@ MAX_ROWS = 10_000_000
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
     """Return a column of integers without nulls."""
-    return numbers(name, table, column).astype(np.int64)
+    return number_column(name, table, column).astype(np.int64)
 
 
-def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
+def number_column(name: str, table: pa.Table, column: str) -> np.ndarray:
     """Return a column of numbers, in its own type, without nulls."""
     values = table[column]
     if values.null_count:

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from helpers.flight_folders import (
@@ -172,6 +174,23 @@ def test_a_flight_that_nothing_can_be_learned_from_is_refused(
         (folder / "meta.json").write_text(meta)
     with pytest.raises(DatasetError, match=says):
         read_flight(folder)
+
+
+@pytest.mark.parametrize(
+    ("table", "column"),
+    [
+        *(("ticks", name) for name in ("attitude_ns", "velocity_ns", "feature_captured_ns")),
+        ("frames", "gate_yaw_rad"),
+    ],
+)
+def test_a_column_of_another_type_is_named(tmp_path: Path, table: str, column: str) -> None:
+    path = flight(tmp_path / "a") / f"{table}.parquet"
+    rows = pq.read_table(path)
+    if column in rows.column_names:
+        rows = rows.drop_columns([column])
+    pq.write_table(rows.append_column(column, pa.array(["x"] * rows.num_rows)), path)
+    with pytest.raises(DatasetError, match=f"{column} must hold a number a row"):
+        read_flight(path.parent)
 
 
 def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
