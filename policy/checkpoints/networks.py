@@ -235,7 +235,10 @@ def load_world_model(path: Path) -> WorldModel:
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
         model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
-    except (PolicyError, ArithmeticError, TypeError, ValueError, RuntimeError) as error:
+    except (
+        *(PolicyError, ArithmeticError, LookupError),
+        *(TypeError, ValueError, RuntimeError),
+    ) as error:
         raise CheckpointError(f"{path}: {error}") from error
     require_fit(path, model, state, "Train it again with this version of mavbridge")
     model.load_state_dict(state)
