@@ -92,7 +92,7 @@ class RcEngine:
             index = self.index_of(axis)
             low = self._params.integer(f"RC{index + 1}_MIN")
             high = self._params.integer(f"RC{index + 1}_MAX")
-            pwm = low + (high - low) * travel // full
+            pwm = low + (high - low) * travel // full & 0xFFFF  # stored without a range check
             self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
 
     def clear_overrides(self) -> None:

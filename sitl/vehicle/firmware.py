@@ -209,7 +209,7 @@ class Autopilot(ABC):
 
     @property
     def system_id(self) -> int:
-        return self.params.integer(self.id_param)
+        return self.params.integer(self.id_param) & 0xFF  # one byte on the wire
 
     @property
     def uptime_ns(self) -> int:

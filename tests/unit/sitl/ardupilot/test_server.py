@@ -87,6 +87,14 @@ def test_streams_slow_down_while_parameters_are_sent(station):
     assert len(named(afterwards[-200:], "ATTITUDE")) > 150
 
 
+def test_sticks_and_a_system_id_beyond_their_range_go_out_as_their_low_bytes(station):
+    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 50)
+    station.send(mav.MAVLink_manual_control_message(1, 0, -5000, 500, 0, 0))
+    station.vehicle.params.set("MAV_SYSID", 300.0)
+    channels = named(station.run(0.1), "RC_CHANNELS")[-1]
+    assert (channels.get_srcSystem(), channels.chan1_raw) == (300 - 256, 65536 - 1000)
+
+
 def test_nan_in_a_message_is_refused_and_counted(station):
     station.send(mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", math.nan, 9))
     assert not named(station.run(0.1), "PARAM_VALUE")
