@@ -199,6 +199,7 @@ def _at_rate(ap: Px4, period_ms: int) -> int:
 
 
 NS_PER_US = 1000
+MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL has an int32
 
 _BOTH = {CURRENT_MODE: 0.5, mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0}
 ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
@@ -286,6 +287,7 @@ class Px4Endpoint(Endpoint[Px4]):
             self._streams.pop(message_id, None)
         else:
             sent_us = self._ap.now_ns // NS_PER_US
+            interval_us = min(interval_us, MAX_INTERVAL_US)
             self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
 
     def _due(self) -> list[int]:
