@@ -172,7 +172,7 @@ class Horizontal:
         """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold."""
         params = self._params
         full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
-        per_s = full / params["MPC_VEL_MANUAL"]
+        per_s = full / max(0.1, params["MPC_VEL_MANUAL"])
         if wanted_mps == STILL:
             per_s = BRAKING_PER_S
         gaps = [per_s * (w - v) for w, v in zip(wanted_mps, self.speed_mps, strict=True)]
@@ -193,7 +193,7 @@ class Horizontal:
             self._reaction_s -= STEP_S
             self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
             return self.accel_mps2
-        accel, jerk = params["MPC_ACC_HOR"], params["MPC_JERK_AUTO"]
+        accel, jerk = max(0.1, params["MPC_ACC_HOR"]), max(0.1, params["MPC_JERK_AUTO"])
         if self._place_m is None:
             self._place_m = _place(body)
             lead_s = math.hypot(*self.speed_mps) / (2.0 * accel) + accel / (2.0 * jerk)

@@ -131,4 +131,5 @@ class Px4Params(Params):
 
     @property
     def dead_zone(self) -> float:
-        return self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]
+        share = self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]
+        return min(share, 0.99)

@@ -257,8 +257,10 @@ def clamp(value: float, limit: float) -> float:
 
 def shorten(vector: tuple[float, float], limit: float) -> tuple[float, float]:
     """Limit a vector's length and keep its direction."""
-    scale = limit / max(limit, math.hypot(*vector))
-    return vector[0] * scale, vector[1] * scale
+    length = math.hypot(*vector)
+    if length <= max(0.0, limit):
+        return vector
+    return vector[0] * (limit / length), vector[1] * (limit / length)
 
 
 class HeightController:

@@ -49,6 +49,26 @@ def test_a_lost_position_leaves_posctl_for_altctl_and_gives_it_back(airborne):
     assert airborne.ap.mode is Px4Mode.POSCTL
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("MAN_DEADZONE", 1.0),
+        ("MPC_ACC_HOR", 0.0),
+        ("MPC_JERK_AUTO", -1.0),
+        ("MPC_VEL_MANUAL", 0.0),
+        ("MPC_XY_CRUISE", 0.0),
+    ],
+)
+def test_a_parameter_that_leaves_no_motion_does_not_end_the_simulator(airborne, name, value):
+    airborne.vehicle.params.set(name, value)
+    for mode in ((3, 0), (4, 3), (3, 0)):
+        airborne.run(0.2, {0: MID})
+        assert airborne.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode) == mav.MAV_RESULT_ACCEPTED
+        airborne.run(0.5, {0: MID})
+        airborne.run(0.1, {0: (500, 0, 500, 300)})
+    assert airborne.ap.mode is Px4Mode.POSCTL
+
+
 def test_a_return_climbs_flies_home_lands_and_disarms(ends):
     ends.run(0.1)
     ends.vehicle.launch(replace(START, position_ned_m=(20.0, 0.0, -10.0)))
