@@ -82,7 +82,7 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
     is_shaded = random.random(len(course.gates)) < conditions.shaded_gates
     is_hidden = random.random(len(course.gates)) < conditions.hidden_gates
     gates = [*course.gates, *_stray_gates(course, conditions)]
-    corners, normals, rgb, owners = [], [], [], []
+    faces: list[tuple[FloatArray, FloatArray, FloatArray, int]] = []  # as the fields of Faces
     centers = [gate.center_ned_m for gate in gates]
     for owner, gate in enumerate(gates):
         cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
@@ -90,31 +90,27 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
         for face in _faces_of(gate, conditions):
             normal_ned = ned_from_gate @ np.array(face.normal)
             light = light_on(normal_ned) * (SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0)
-            corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
-            normals.append(normal_ned)
-            rgb.append(np.array(face.rgb) * light)
-            owners.append(owner)
+            corners_m = np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m
+            faces.append((corners_m, normal_ned, np.array(face.rgb) * light, owner))
         if is_hidden[gate.index] and owner < len(course.gates):
             ahead_m, aside_m = -random.uniform(*PANEL_AHEAD_M), random.uniform(*PANEL_ASIDE_M)
             aside_m *= random.choice((-1.0, 1.0))
             down_m = (-gate.size_m, -gate.center_ned_m[2])
             panel_m = np.array(_upright(ahead_m, aside_m, PANEL_WIDTH_M, down_m))
-            corners.append(panel_m @ ned_from_gate.T + gate.center_ned_m)
-            normals.append(np.array(BOTH_SIDES))
-            rgb.append(tinted(PANEL_RGB, conditions.ground_tint))
-            owners.append(len(centers))
-            centers.append(tuple(corners[-1].mean(axis=0).tolist()))
+            corners_m = panel_m @ ned_from_gate.T + gate.center_ned_m
+            rgb = tinted(PANEL_RGB, conditions.ground_tint)
+            faces.append((corners_m, np.array(BOTH_SIDES), rgb, len(centers)))
+            centers.append(tuple(corners_m.mean(axis=0).tolist()))
     for part in clutter(course, conditions):
-        corners.extend(part.corners_m)
-        normals.extend(part.normals)
-        rgb.extend(np.array(part.rgb) * light_on(normal) for normal in part.normals)
-        owners.extend([len(centers)] * len(part.normals))
+        for corners_m, normal in zip(part.corners_m, part.normals, strict=True):
+            faces.append((corners_m, normal, np.array(part.rgb) * light_on(normal), len(centers)))
         centers.append(tuple(part.corners_m.mean(axis=(0, 1)).tolist()))
+    corners, normals, colours, owners = map(np.array, zip(*faces, strict=True))
     return Faces(
-        corners_ned_m=np.array(corners),
-        normals_ned=np.array(normals),
-        rgb=np.array(rgb),
-        owner=np.array(owners, dtype=np.intp),
+        corners_ned_m=corners,
+        normals_ned=normals,
+        rgb=colours,
+        owner=owners,
         centers_ned_m=np.array(centers),
     )
 
