@@ -15,7 +15,7 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.server import MAX_STATUSTEXT, Endpoint
+from sitl.link.server import Endpoint
 from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
 from sitl.vehicle.rotation import Vec3
@@ -225,11 +225,6 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
             return 0
         stream = self._streams.get(message_id)
         return stream.interval_ms * 1000 if stream else -1
-
-    def send_text(self, severity: int, text: str) -> None:
-        for start in range(0, len(text), MAX_STATUSTEXT):
-            chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
-            self.send(mav.MAVLink_statustext_message(severity, chunk))
 
     @property
     def _shortest_ms(self) -> int:

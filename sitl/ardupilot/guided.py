@@ -31,6 +31,7 @@ POSITION_GAIN_PER_S = 1.0
 MAX_POSITION_ERROR_M = 2.0
 MAX_LEAN_ACCEL_MPS2 = 5.0
 MIN_CLIMB_ACCEL_MPS2 = 0.5
+STOP = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
 
 
 class Submode(Enum):
@@ -51,7 +52,7 @@ class GuidedControl:
         self._attitude = attitude
         self._height = height
         self.submode = Submode.ATTITUDE
-        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)  # followed in Submode.VELOCITY
+        self.velocity = STOP  # followed in Submode.VELOCITY
         self._takeoff_height_m = 0.0
         self._setpoint: AttitudeSetpoint | None = None
         self._has_thrust = False
@@ -156,7 +157,7 @@ class GuidedControl:
             down = -min(up, braking, TAKEOFF_GAIN_PER_S * to_go_m)
         elif self._is_over(now_ns):
             north = east = down = yaw_rate = 0.0
-            self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
+            self.velocity = STOP
         roll = pitch = 0.0
         if has_position:
             accel = self._track.step((north, east), body)
@@ -169,7 +170,7 @@ class GuidedControl:
 
     def _start(self, submode: Submode, body: BodyState) -> None:
         """Set the velocity to zero, and reset the controllers if the submode changes."""
-        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
+        self.velocity = STOP
         if self.submode is not submode:
             self.submode = submode
             self._height.reset(body)

@@ -51,8 +51,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         super().__init__(ap, [ArduPilotEndpoint(ap) for _ in range(link_count)], log)
         self._mode = ap.mode
 
-    def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None: ...
-
     def _announce(self) -> None:
         """Send a heartbeat at once after a mode change."""
         if self._ap.mode is not self._mode:

@@ -43,6 +43,7 @@ class Endpoint(ABC, Generic[Ap]):
         self._outgoing = bytearray()
         self._telemetry = telemetry
         self._ap = ap
+        self._text_id = 0
         self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
 
@@ -57,8 +58,16 @@ class Endpoint(ABC, Generic[Ap]):
     @abstractmethod
     def interval_us(self, message_id: int) -> int: ...
 
-    @abstractmethod
-    def send_text(self, severity: int, text: str) -> None: ...
+    def send_text(self, severity: int, text: str) -> None:
+        """Send STATUSTEXT; number the chunks of a long text."""
+        data = text.encode("ascii", "replace")
+        if len(data) <= MAX_STATUSTEXT:
+            self.send(mav.MAVLink_statustext_message(severity, data))
+            return
+        self._text_id = self._text_id % 65535 + 1
+        for index, start in enumerate(range(0, len(data) + 1, MAX_STATUSTEXT)):
+            chunk = data[start : start + MAX_STATUSTEXT]
+            self.send(mav.MAVLink_statustext_message(severity, chunk, self._text_id, index))
 
     def parse(self, data: bytes) -> Iterator[Message]:
         """Yield the complete messages in these bytes; unreadable frames are skipped."""
@@ -174,9 +183,8 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
     def _is_accepted(self, message: Message) -> bool:
         """True if the firmware acts on the message of this sender."""
 
-    @abstractmethod
     def _pass_on(self, link: Link, message: Message) -> None:
-        """Process every message of the link before dispatch, including those for other systems."""
+        """Called with every message of the link, also those for other systems. No-op."""
 
     @abstractmethod
     def _announce(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.server import MAX_STATUSTEXT, Endpoint, by_message
+from sitl.link.server import Endpoint, by_message
 from sitl.link.telemetry import Fields, Message, Telemetry
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
@@ -232,7 +232,7 @@ class Px4Endpoint(Endpoint[Px4]):
     def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
         default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
         self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
-        self._text_id = self._event_sequence = 0
+        self._event_sequence = 0
         super().__init__(ap, Px4Telemetry(ap))
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
         self._streams: dict[int, _Stream] = {}
@@ -266,17 +266,9 @@ class Px4Endpoint(Endpoint[Px4]):
         return -1 if stream is None else stream.interval_us
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT once a ground station is known; number the chunks of a long text."""
-        if not self.has_gcs:
-            return
-        data = text.encode("ascii", "replace")
-        if len(data) <= MAX_STATUSTEXT:
-            self.send(mav.MAVLink_statustext_message(severity, data))
-            return
-        self._text_id = self._text_id % 65535 + 1
-        for index, start in enumerate(range(0, len(data) + 1, MAX_STATUSTEXT)):
-            chunk = data[start : start + MAX_STATUSTEXT]
-            self.send(mav.MAVLink_statustext_message(severity, chunk, self._text_id, index))
+        """Send STATUSTEXT once a ground station is known."""
+        if self.has_gcs:
+            super().send_text(severity, text)
 
     def send_event(self, event: Event) -> None:
         self._event_sequence = (self._event_sequence + 1) % 65536
