@@ -13,7 +13,7 @@ from sitl import UsageError
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
-from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal, wall_ns
+from sitl.clock import NS_PER_S, Clock, StopRequest, next_slot_ns, stop_on_signal, wall_ns
 from sitl.course import LOOP_SEEDS, Course, course_to_json, make_course
 from sitl.link.transport import RcInput, Transport, open_transport
 from sitl.pilot.transmitter import DEFAULT_AXES, PILOTS, Pilot, make_pilot, prepare_vehicle
@@ -63,8 +63,7 @@ def fly(
         for link_id, transport in enumerate(transports):
             transport.send(vehicle.take_outgoing(link_id))
         status.print_changes()
-        missed = max(0, (clock.now_ns() - due_ns) // STEP_NS)
-        due_ns += (missed + 1) * STEP_NS
+        due_ns = next_slot_ns(due_ns, STEP_NS, clock.now_ns())
         clock.sleep_until_ns(due_ns)
 
 
@@ -133,7 +132,7 @@ def filming(
             )
             clock.sleep_until_ns(pose.stamp_ns + to_end_ns)
             publisher.publish(image, pose.stamp_ns)
-            due_ns += period_ns * max(1, -(-(clock.now_ns() - due_ns) // period_ns))
+            due_ns = next_slot_ns(due_ns, period_ns, clock.now_ns())
 
     thread = threading.Thread(target=film, name="sitl-camera", daemon=True)
     thread.start()

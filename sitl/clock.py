@@ -26,6 +26,11 @@ def wall_ns() -> int:
     return time.time_ns()
 
 
+def next_slot_ns(due_ns: int, period_ns: int, now_ns: int) -> int:
+    """Return the slot of a grid after ``due_ns``; slots that ``now_ns`` has reached are skipped."""
+    return due_ns + period_ns * (1 + max(0, now_ns - due_ns) // period_ns)
+
+
 def monotonic_from_wall_ns(wall_ns: int) -> int:
     """Convert a recent CLOCK_REALTIME stamp, for example the kernel's stamp of a datagram."""
     return time.monotonic_ns() - (time.time_ns() - wall_ns)

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_MS, NS_PER_S, next_slot_ns
 from sitl.link.server import Endpoint
 from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
@@ -240,7 +240,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         for message_id in ready:
             stream = self._streams[message_id]
             period_ns = self._period_ns(stream.interval_ms) * slowdown
-            stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
+            stream.due_ns = next_slot_ns(stream.due_ns, period_ns, now_ns)
             stream.late_ns = self._random_ns(self._conditions.stream_jitter_ms * NS_PER_MS)
         return ready
 

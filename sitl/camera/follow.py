@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
-from sitl.clock import NS_PER_S, Clock
+from sitl.clock import NS_PER_S, Clock, next_slot_ns
 from sitl.course import Course
 from sitl.link.telemetry import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
@@ -157,4 +157,4 @@ def film_vehicle(
                 was_known = pose is not None
                 text = "pose received, publishing frames" if was_known else NO_POSE
                 sys.stderr.write(f"camera: {url}: {text}\n")
-            due_ns += period_ns * (1 + max(0, clock.now_ns() - due_ns) // period_ns)
+            due_ns = next_slot_ns(due_ns, period_ns, clock.now_ns())
