@@ -160,7 +160,6 @@ class Relay(Worker):
         self._joystick = dialect.MAVLink(None, srcSystem=BRIDGE, srcComponent=190)
         self._news = threading.Condition()
         self.sent: list[Sent] = []
-        self.overrides: list[Override] = []
         self.has_flown = threading.Event()
         self.has_heard = threading.Event()
         """Set once the vehicle has sent something, so that its address is known."""
@@ -171,12 +170,16 @@ class Relay(Worker):
         self._socket.close()
         self.carrier.close()
 
+    @property
+    def overrides(self) -> list[Override]:
+        """All overrides so far, releases included."""
+        return [sticks for sent in self.sent if (sticks := sent.override) is not None]
+
     def forget(self) -> int:
         """Forget the flight so far, because another begins. Return the number of its overrides."""
         with self._news:
             count = len(self.overrides)
             self.sent.clear()
-            self.overrides.clear()
             self.has_flown.clear()
             return count
 
@@ -190,15 +193,12 @@ class Relay(Worker):
         steering = self.newest_steering(rows)
         return len(steering) == rows and all(sent.leans for sent in steering)
 
-    def impair(
-        self, *, to_vehicle: LinkFaults | None = None, to_bridge: LinkFaults | None = None
-    ) -> int:
-        """Change the link from now on; return the time. None leaves a direction unchanged."""
+    def impair(self, way: str, faults: LinkFaults) -> int:
+        """Change ``to_vehicle``, ``to_bridge`` or ``both`` from now on; return the time."""
         at_ns = self._clock.now_ns()
-        if to_vehicle is not None:
-            self._to_vehicle.impair(to_vehicle)
-        if to_bridge is not None:
-            self._to_bridge.impair(to_bridge)
+        ways = {"to_vehicle": self._to_vehicle, "to_bridge": self._to_bridge}
+        for one in ways.values() if way == "both" else [ways[way]]:
+            one.impair(faults)
         return at_ns
 
     def rewrite(self, change: Rewrite) -> int:
@@ -313,8 +313,6 @@ class Relay(Worker):
             for message in messages:
                 sent = Sent(now_ns, message)
                 self.sent.append(sent)
-                if (sticks := sent.override) is not None:
-                    self.overrides.append(sticks)
                 if sent.climbs:
                     self.has_flown.set()
             self._news.notify_all()

@@ -206,8 +206,7 @@ def link(
         if moments:
             stage.observe(ramp_s / ramp_steps)
         now = replace(last, delay_ms=last.delay_ms * step_number / ramp_steps)
-        ways = ("to_vehicle", "to_bridge") if way == "both" else (way,)
-        moments.append(stage.relay.impair(**dict.fromkeys(ways, now)))
+        moments.append(stage.relay.impair(way, now))
     return moments[0]
 
 

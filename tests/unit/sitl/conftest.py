@@ -1,10 +1,11 @@
-"""A pilot for the autopilot without its link: sticks by override, time by steps."""
+"""An ArduPilot without its link, flown by overrides and steps; the far ends of both firmwares."""
 
 import math
 from collections.abc import Callable
 
 import pytest
 
+from helpers.ends import Ends, px4_ends
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
@@ -71,3 +72,15 @@ class Pilot:
 @pytest.fixture
 def pilot() -> Pilot:
     return Pilot(VehicleConfig())
+
+
+@pytest.fixture
+def station() -> Ends:
+    """The far end of an ArduPilot's link."""
+    return Ends()
+
+
+@pytest.fixture
+def ends() -> Ends:
+    """The far end of a PX4's link."""
+    return px4_ends()

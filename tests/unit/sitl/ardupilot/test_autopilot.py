@@ -1,12 +1,10 @@
 """Modes, arming and failsafes of ArduCopter on the simulated body, without a link."""
 
 import math
-from dataclasses import replace
 
 import pytest
 
 from sitl.ardupilot.flight_modes import Mode
-from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import IDLE_RECEIVER_US, VehicleConfig
 from sitl.vehicle.rotation import from_euler
 
@@ -58,22 +56,6 @@ def test_arming_is_refused_with_its_reason(pilot, seconds, mode, refusal):
     assert pilot.ap.set_mode(mode)
     assert pilot.ap.arm(force=False) == (refusal is None)
     assert pilot.texts() == ["Arming motors" if refusal is None else f"Arm: {refusal}"]
-
-
-@pytest.mark.parametrize("mode", [Mode.BRAKE, Mode.LOITER, Mode.POSHOLD])
-def test_position_modes_stop_and_hold_in_the_wind(pilot, mode):
-    windy = replace(NOMINAL, wind_ned_mps=(4.0, 0.0, 0.0), gust_rms_mps=0.5)
-    pilot = type(pilot)(VehicleConfig(conditions=windy))
-    pilot.take_off()
-    pilot.hold(1.5, roll=1750)
-    start_m = pilot.height_m
-    assert math.hypot(*pilot.ap.truth.velocity_ned_mps) > 2.0
-    assert pilot.ap.set_mode(mode)
-    pilot.hold(5.0)
-    stopped_ned_m = pilot.ap.truth.position_ned_m
-    pilot.hold(20.0)
-    assert math.dist(pilot.ap.truth.position_ned_m, stopped_ned_m) < 0.3
-    assert pilot.height_m == pytest.approx(start_m, abs=0.3)
 
 
 def test_a_lost_position_levels_the_vehicle_and_refuses_position_modes(pilot):

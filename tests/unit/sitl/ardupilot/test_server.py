@@ -7,12 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import named
+from helpers.contract_peers import last, named
 from helpers.ends import Ends
 from sitl.ardupilot.endpoint import ArduPilotTelemetry
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import VehicleConfig
 
 
 def test_only_heartbeats_and_timesync_come_without_a_request(station):
@@ -166,3 +167,29 @@ def test_the_report_counts_the_setpoints_that_were_followed(station):
     setpoints = vehicle.log.summary(vehicle.ap)["setpoints"]
     assert setpoints["count"] == 5
     assert setpoints["rate_hz"] == pytest.approx(50.0, rel=0.01)
+
+
+def override(station, *values_us):
+    station.send(mav.MAVLink_rc_channels_override_message(1, 1, *values_us, *[65535] * 4))
+    return station.run(0.2)
+
+
+def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health():
+    receiver = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+    config = VehicleConfig(receiver_us=None, estimator_ready_s=0.0, position_ready_s=0.0)
+    station = Ends(config=config)
+    station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
+    station.interval(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
+    assert not last(station.run(0.2), "SYS_STATUS").onboard_control_sensors_present & receiver
+    override(station, 1500, 1500, 1000, 1500)
+    assert station.vehicle.ap.set_mode(Mode.ALT_HOLD)
+    assert station.vehicle.ap.arm(force=False)
+    for messages, is_healthy, state in (
+        (override(station, 1500, 1500, 1000, 1500), True, mav.MAV_STATE_ACTIVE),
+        (station.run(1.2), False, mav.MAV_STATE_CRITICAL),
+        (override(station, 1500, 1500, 1000, 1500), True, mav.MAV_STATE_STANDBY),
+    ):
+        status = last(messages, "SYS_STATUS")
+        assert status.onboard_control_sensors_present & receiver
+        assert bool(status.onboard_control_sensors_health & receiver) == is_healthy
+        assert last(messages, "HEARTBEAT").system_status == state

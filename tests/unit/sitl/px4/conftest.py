@@ -1,8 +1,0 @@
-import pytest
-
-from helpers.ends import px4_ends
-
-
-@pytest.fixture
-def ends():
-    return px4_ends()
