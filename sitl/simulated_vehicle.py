@@ -16,9 +16,8 @@ from sitl.px4.server import Px4Server
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
-from sitl.vehicle.firmware import Autopilot, StatusText
+from sitl.vehicle.firmware import Autopilot, Severity
 
-SEVERITY_CRITICAL = 2
 MAX_CATCH_UP_NS = NS_PER_S
 """Longest time simulated in one call; after a longer stall the rest follows in later calls."""
 
@@ -90,7 +89,7 @@ class SimulatedVehicle:
             self.log.on_step(ap)
             if (crash := self.log.crash) is not None and not had_crashed:
                 text = f"Crash: hit {crash.hit} at {crash.speed_mps:.1f} m/s"
-                ap.texts.append(StatusText(SEVERITY_CRITICAL, text))
+                ap.send_text(Severity.CRITICAL, text)
         self.pose = Pose(stamp_ns=ap.now_ns, body=ap.truth)
         self.server.step(now_ns)
         if self.server.reboot_requested:

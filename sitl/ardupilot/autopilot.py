@@ -23,7 +23,7 @@ from sitl.ardupilot.rc import (
 from sitl.clock import NS_PER_S
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
-from sitl.vehicle.firmware import STOPPED, Autopilot, HeldGesture
+from sitl.vehicle.firmware import STOPPED, Autopilot, HeldGesture, Severity
 from sitl.vehicle.rotation import cos_tilt
 
 LOW_READS_TO_FAIL = 3
@@ -92,7 +92,6 @@ class GcsFailsafe:
 
 CRASH_TILT_COS = 0.7
 CRASH_AFTER_NS = NS_PER_S
-SEVERITY_CRITICAL, SEVERITY_WARNING, SEVERITY_INFO = 2, 4, 6
 
 FAILSAFE_MODES = {
     "FS_THR_ENABLE": {3: Mode.LAND, 7: Mode.BRAKE},
@@ -186,12 +185,12 @@ class ArduCopter(Autopilot):
             return True
         refusal = self.prearm_refusal() or self._stick_refusal(by_rudder=by_rudder)
         if refusal is not None and not force:
-            self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
+            self.send_text(Severity.CRITICAL, f"Arm: {refusal}")
             return False
         self.armed = True
         self._armed_ns = self._idle_since_ns = self.now_ns
         self.control.enter(self.mode, self.sensed)
-        self._send_text(SEVERITY_INFO, "Arming motors")
+        self.send_text(Severity.INFO, "Arming motors")
         return True
 
     def disarm(self, *, force: bool) -> bool:
@@ -200,7 +199,7 @@ class ArduCopter(Autopilot):
             return False
         if self.armed:
             self.armed = False
-            self._send_text(SEVERITY_INFO, "Disarming motors")
+            self.send_text(Severity.INFO, "Disarming motors")
         return True
 
     def take_off(self, height_m: float) -> bool:
@@ -230,7 +229,7 @@ class ArduCopter(Autopilot):
         elif mode.needs_position and self.armed and not self.position_ready:
             refusal = "requires position"
         if refusal is not None:
-            self._send_text(SEVERITY_WARNING, f"Mode change to {mode.name} failed: {refusal}")
+            self.send_text(Severity.WARNING, f"Mode change to {mode.name} failed: {refusal}")
             return False
         self.mode = mode
         self.control.enter(mode, self.sensed)
@@ -294,7 +293,7 @@ class ArduCopter(Autopilot):
         is_tipped = self.armed and self.sensed.touching and is_tilted
         self._tipped_since_ns = self._since(self._tipped_since_ns, is_tipped)
         if self._has_held(self._tipped_since_ns, CRASH_AFTER_NS):
-            self._send_text(SEVERITY_CRITICAL, "Crash: Disarming")
+            self.send_text(Severity.CRITICAL, "Crash: Disarming")
             self.disarm(force=True)
 
     def _read_radio(self) -> None:
@@ -313,7 +312,7 @@ class ArduCopter(Autopilot):
         if self.radio_failsafe.active:
             self._fail_over("Radio", "FS_THR_ENABLE")
         else:
-            self._send_text(SEVERITY_WARNING, "Radio Failsafe Cleared")
+            self.send_text(Severity.WARNING, "Radio Failsafe Cleared")
 
     def _read_gesture(self) -> None:
         self._gesture.see(gesture_side(read_sticks(self.rc, self.params)), self.now_ns)
@@ -334,29 +333,29 @@ class ArduCopter(Autopilot):
 
     def _on_gcs_change(self) -> None:
         if not self.gcs_failsafe.active:
-            self._send_text(SEVERITY_WARNING, "GCS Failsafe Cleared")
+            self.send_text(Severity.WARNING, "GCS Failsafe Cleared")
             return
         self.rc.clear_overrides()
         continues = self.params.integer("FS_OPTIONS") & FS_OPTION_PILOT_CONTINUES
         if self.armed and self.mode.piloted and continues:
-            self._send_text(SEVERITY_WARNING, "GCS Failsafe - Continuing Pilot Control")
+            self.send_text(Severity.WARNING, "GCS Failsafe - Continuing Pilot Control")
         else:
             self._fail_over("GCS", "FS_GCS_ENABLE")
 
     def _fail_over(self, who: str, parameter: str) -> None:
         """Land, brake or return as the parameters say; the mode stays after the cause has gone."""
         if self.armed and self.landed:
-            self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
+            self.send_text(Severity.WARNING, f"{who} Failsafe - Disarming")
             self.disarm(force=True)
             return
         options = self.params.integer("FS_OPTIONS")
         if self.armed and self.mode is Mode.LAND and options & FS_OPTION_LANDING_CONTINUES:
-            self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Continuing Landing")
+            self.send_text(Severity.WARNING, f"{who} Failsafe - Continuing Landing")
             return
         if self.armed and self.mode.is_guided and who == "Radio" and options & FS_OPTION_GUIDED:
-            self._send_text(SEVERITY_WARNING, "Radio Failsafe - Continuing Guided Mode")
+            self.send_text(Severity.WARNING, "Radio Failsafe - Continuing Guided Mode")
             return
-        self._send_text(SEVERITY_WARNING, f"{who} Failsafe")
+        self.send_text(Severity.WARNING, f"{who} Failsafe")
         if not self.armed:
             return
         mode = FAILSAFE_MODES[parameter].get(self.params.integer(parameter), Mode.RTL)

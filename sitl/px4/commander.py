@@ -12,9 +12,8 @@ from sitl.px4.modes import LostSticks, Phase, Px4Mode, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
 from sitl.vehicle.config import VehicleConfig
-from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.firmware import Autopilot, Severity
 
-SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
 _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
@@ -269,11 +268,11 @@ class Commander(Autopilot):
             self._deny(text, "commander_failsafe_enter_hold")
 
     def _deny(self, text: str, event: str) -> None:
-        self._tell(text, event, SEVERITY_CRITICAL)
+        self._tell(text, event, Severity.CRITICAL)
 
-    def _tell(self, text: str, event: str, severity: int = SEVERITY_INFO) -> None:
+    def _tell(self, text: str, event: str, severity: Severity = Severity.INFO) -> None:
         # The tab marks a text that is also sent as an event; ground stations hide it.
-        self._send_text(severity, text + "\t")
+        self.send_text(severity, text + "\t")
         self._emit(event)
 
     def _emit(self, name: str) -> None:

@@ -9,6 +9,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from enum import IntEnum
 from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -24,10 +25,16 @@ LANDED_SPEED_MPS = 0.3
 _INT32_LIMIT = 1 << 31
 
 
-class StatusText(NamedTuple):
-    """STATUSTEXT for the ground station, with MAVLink's severity."""
+class Severity(IntEnum):
+    """MAV_SEVERITY of a text."""
 
-    severity: int
+    CRITICAL, WARNING, INFO = 2, 4, 6
+
+
+class StatusText(NamedTuple):
+    """STATUSTEXT for the ground station."""
+
+    severity: Severity
     text: str
 
 
@@ -286,5 +293,5 @@ class Autopilot(ABC):
     def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
         return since_ns is not None and self.now_ns - since_ns >= duration_ns
 
-    def _send_text(self, severity: int, text: str) -> None:
+    def send_text(self, severity: Severity, text: str) -> None:
         self.texts.append(StatusText(severity, text))
