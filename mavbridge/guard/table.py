@@ -119,9 +119,10 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
     The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
-    was disarmed, rebooted, is in a failsafe or follows sticks other than ours; the override switch
-    is low; the engage switch is low (in flight, or while an engage command is carried out); the
-    vehicle is silent while another one uses its system id; or a relevant parameter was changed.
+    was disarmed, rebooted, is in a failsafe that changes the mode (PX4: in any) or follows sticks
+    other than ours; the override switch is low; the engage switch is low (in flight, or while an
+    engage command is carried out); the vehicle is silent while another one uses its system id; or a
+    relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -132,9 +133,10 @@ def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """not ready in time
 
     After 90 s with `--arm`, plus one second per metre of `--takeoff`; after 3 s with another engage
-    command; at once if waiting cannot help: the vehicle lacks the mode, or the policy is too slow.
+    command; at once if waiting cannot help: the vehicle lacks the mode or is in a failsafe, or the
+    policy is too slow.
     """
-    problem = m.engage.impossibility(now)
+    problem = m.engage.impossibility(now) or _failsafe(m, now, keeps_mode=True)
     if problem is None and now.now_ns <= m.until_ns:
         return None
     if problem is None and m.starting_ns is not None:
@@ -165,15 +167,17 @@ def landed(_: Memory, now: EngagementInputs) -> EndRequest | None:
     return None if now.landing is None else EndRequest(now.landing, end="landed")
 
 
-def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
+def fault(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**fault**
 
     No usable chunk, or no attitude from the vehicle, for longer than [the grace](#the-grace); 5
     malformed chunks (NaN) in a second; the envelope was left; the link was lost; the system has
     refused our packets for 100 ms; the vehicle does not hear our sticks; a command could not be
-    encoded; the vehicle's clock was set back; or the vehicle sends from another address.
+    encoded; the vehicle's clock was set back; the vehicle sends from another address; or ArduPilot
+    is in a failsafe that keeps the mode.
     """
-    reason = now.link.problem or now.chunk_fault or now.envelope_problem
+    problem = now.link.problem or now.chunk_fault or now.envelope_problem
+    reason = problem or _failsafe(m, now, keeps_mode=True)
     return None if reason is None else EndRequest(reason, is_fault=True)
 
 
@@ -230,14 +234,14 @@ def is_ours(m: Memory, now: EngagementInputs) -> bool:
 def follows_us(m: Memory, now: EngagementInputs) -> bool:
     """it would keep following our last setpoint
 
-    It is still armed in a mode that follows setpoints, without a failsafe, and follows no other
-    source. After a release it would hold the last setpoint for up to 3 s, and sticks do nothing in
-    that mode.
+    It is still armed in a mode that follows setpoints, on PX4 without a failsafe, and follows no
+    other source. After a release it would hold the last setpoint for up to 3 s, and sticks do
+    nothing in that mode.
     """
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
         (m.settings.is_setpoint and now.status.armed and is_own)
-        and (not now.link.is_overruled and not now.status.is_failsafe)
+        and (not now.link.is_overruled and _failsafe(m, now, keeps_mode=False) is None)
         and (now.status.mode == m.own_mode and now.status.mode in now.link.modes.setpoint)
     )
 
@@ -266,6 +270,24 @@ def _switch_off(m: Memory) -> Reason:
     return because(Code.ENGAGE_SWITCH_OFF, channel=m.settings.engage_channel or 0)
 
 
+def _is_mode_ours(m: Memory, now: EngagementInputs) -> bool:
+    is_late = m.phase in (LEAVING, HOLDING) and m.has_asked(now)
+    is_ours = now.status.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
+    return is_ours or is_late
+
+
+def _failsafe(m: Memory, now: EngagementInputs, *, keeps_mode: bool) -> Reason | None:
+    """Return the reason if an armed vehicle is in a failsafe that keeps our mode; False: any other.
+
+    ArduPilot reports a failsafe together with the mode that it sets. PX4 may report it earlier, so
+    that our mode tells nothing there.
+    """
+    is_kept = _is_mode_ours(m, now) and not now.link.modes.needs_setpoints_first
+    if not (now.status.is_failsafe and now.status.armed) or is_kept is not keeps_mode:
+        return None
+    return because(Code.FAILSAFE, mode=now.status.mode)
+
+
 def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     is_preparing = m.phase is Phase.PREPARING
     if now.link.interruptions != m.seen_interruptions:
@@ -278,11 +300,9 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return _switch_off(m)
     if not now.status.armed and not is_preparing:
         return because(Code.DISARMED)
-    if now.status.is_failsafe and now.status.armed:
-        return because(Code.FAILSAFE, mode=now.status.mode)
-    is_ours = now.status.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
-    is_late = m.phase in (LEAVING, HOLDING) and m.has_asked(now)
-    if m.own_mode is not None and not is_ours and not is_late:
+    if (reason := _failsafe(m, now, keeps_mode=False)) is not None:
+        return reason
+    if m.own_mode is not None and not _is_mode_ours(m, now):
         return because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
     return because(Code.DISARMED) if is_preparing and m.was_armed and not now.status.armed else None
 

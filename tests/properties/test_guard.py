@@ -229,9 +229,14 @@ class GuardMachine(RuleBasedStateMachine):
 
     @rule(is_failsafe=st.booleans())
     def fail_safe(self, is_failsafe: bool) -> None:
+        was_flying = self.world.phase is Phase.FLYING
         self.world.vehicle.is_failsafe = is_failsafe
         self.must_end = is_failsafe
         self.step()
+        reason = self.world.guard._engagement.reason
+        is_px4, is_kept = self.world.autopilot == "px4", self.world.vehicle.mode == self.world.mode
+        if was_flying and not is_px4 and is_kept and reason and reason.codes == (Code.FAILSAFE,):
+            assert self.world.phase is Phase.LEAVING, "nobody flies a vehicle that keeps the mode"
 
     @rule()
     def reboot(self) -> None:

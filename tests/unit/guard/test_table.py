@@ -32,6 +32,8 @@ TILT = because(Code.BEYOND, quantity="tilt", value=70.0, limit=60.0, unit="deg")
 OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
 REBOOT = {"interruption": because(Code.REBOOTED)}
 RADIO_FAILSAFE = {"is_failsafe": True, "mode": "RTL"}
+KEPT = {"is_failsafe": True}
+"""A failsafe that leaves the mode as it is: of ArduPilot, for example BATT_FS_LOW_ACT 0."""
 SIGNAL = EndRequest(because(Code.SIGNAL))
 SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
 LANDS: dict[str, Any] = {"on_fault": "rtl", "then": "land"}
@@ -143,6 +145,13 @@ class Case(NamedTuple):
 
 ACT, KEY = {"act": "engage"}, {"act": "release"}
 in_offboard = partial(flying, OFFBOARD, **SETPOINTS)
+in_guided = partial(
+    flying,
+    altered(AIRBORNE, mode="GUIDED_NOGPS"),
+    is_setpoint=True,
+    modes=("GUIDED_NOGPS",),
+    **LANDS,
+)
 silent = {"heard_ns": 0}
 # fmt: off
 CASES = {
@@ -220,6 +229,9 @@ CASES = {
         arm=True), {"mode": "LOITER"}, PREPARING, IDLE),
     "failsafe on the ground": Case(arming, {"is_failsafe": True}, PREPARING, IDLE),
     "failsafe": Case(armed, RADIO_FAILSAFE, RELEASING, RELEASE, why=Code.FAILSAFE),
+    "failsafe that keeps the mode": Case(armed, KEPT, LEAVING, NEUTRAL, "RTL", Code.FAILSAFE),
+    "failsafe, the pilot has the sticks": Case(asked, KEPT, RELEASED, why=Code.FAILSAFE,
+        refusal=Code.FAILSAFE),
     "disarmed": Case(armed, {"armed": False}, RELEASING, RELEASE, why=Code.DISARMED),
     "reboot": Case(armed, {**REBOOT, "armed": False}, RELEASING, RELEASE, why=Code.REBOOTED),
     "parameter, in our OFFBOARD": Case(entering, REBOOT, LEAVING, NEUTRAL, "AUTO.LAND",
@@ -278,6 +290,12 @@ CASES = {
             (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True}),
         )
     },
+    "setpoints, failsafe that keeps the mode": Case(in_guided, KEPT, LEAVING, NEUTRAL, "RTL",
+        Code.FAILSAFE),
+    "setpoints, takeover in it": Case(in_guided, {**KEPT, **REBOOT}, LEAVING, NEUTRAL, "RTL",
+        Code.REBOOTED),
+    "setpoints, failsafe that changes it": Case(in_guided, RADIO_FAILSAFE, RELEASING, RELEASE,
+        why=Code.FAILSAFE),
     "setpoints in a mode of sticks": Case(partial(flying, altered(OFFBOARD, mode="POSCTL"),
         **{**SETPOINTS, "modes": ("POSCTL")}), REBOOT, RELEASING, RELEASE),
     "sticks in a mode of setpoints": Case(partial(flying, altered(AIRBORNE, mode="GUIDED"),
@@ -301,6 +319,7 @@ CASES = {
             (LOST, {"problem": because(LOST), "chunk_fault": NO_CHUNK}),
             (Code.NO_CHUNK, {"chunk_fault": NO_CHUNK, "envelope_problem": TILT}),
             (Code.BEYOND, {"envelope_problem": TILT}),
+            (Code.FAILSAFE, KEPT),
         )
     },
     "a stale chunk alone": Case(flying, {"chunk_problem": NO_IMAGE}, FLYING, POLICY),
@@ -319,6 +338,12 @@ CASES = {
         NEUTRAL),
     "the mode before comes too late to be ours": Case(lambda: after(refused, 1.49),
         {"mode": "BRAKE"}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
+    "the failsafe lasts while leaving": Case(lambda: after(leaving, 0.1, **KEPT), {"mode": "RTL"},
+        HOLDING, NEUTRAL),
+    "the mode before comes late in it": Case(lambda: after(refused, 1.48, **KEPT),
+        {"mode": "BRAKE"}, LEAVING, NEUTRAL, "LAND"),
+    "failsafe's mode while leaving": Case(leaving, {**KEPT, "mode": "LAND"}, RELEASING, RELEASE,
+        why=Code.FAILSAFE),
     "30 s without a word": Case(lambda: after(leaving, 30.21, heard_ns=0), {}, RELEASING, RELEASE,
         why=Code.VEHICLE_LOST),
     "not 30 s yet": Case(lambda: after(leaving, 30.2, heard_ns=0), {}, LEAVING, NEUTRAL),
@@ -349,6 +374,10 @@ CASES = {
         why=Code.DURATION),
     "takeover while holding": Case(holding, {"mode": "ALT_HOLD"}, RELEASING, RELEASE,
         why=Code.MODE_CHANGED),
+    "the failsafe lasts while holding": Case(lambda: after(holding, 9.0, **KEPT), {}, HOLDING,
+        NEUTRAL),
+    "failsafe's mode while holding": Case(holding, {**KEPT, "mode": "LAND"}, RELEASING, RELEASE,
+        why=Code.FAILSAFE),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
         why=Code.DISARMED),
     "held for long": Case(lambda: after(holding, 60.0), {}, HOLDING, NEUTRAL),
