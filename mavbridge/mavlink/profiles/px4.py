@@ -80,6 +80,7 @@ _COMMANDS = {
 } | {f"AUTO.{name}": (_AUTO, sub) for sub, name in _AUTO_MODES}
 _MODES = ModeTable(
     {main << 16: name for main, name in _MAIN_MODES.items()}
+    | {3 << 16 | 1 << 24: "POSCTL.ORBIT"}
     | {main << 16 | sub << 24: name for name, (main, sub) in _COMMANDS.items()},
     _COMMANDS,
     main_mask=0xFF << 16,

@@ -79,6 +79,7 @@ def test_modes_of_a_copter() -> None:
 def test_modes_of_px4_without_a_name_of_their_own() -> None:
     modes = PX4.modes
     assert modes.name(3 << 16 | 2 << 24) == "POSCTL"  # slow: flown with sticks all the same
+    assert modes.name(3 << 16 | 1 << 24) == "POSCTL.ORBIT"  # DO_ORBIT of a station: a takeover
     assert modes.name(4 << 16 | 8 << 24) == "AUTO"
     assert modes.name(10 << 16) == "TERMINATION"
     for name in ("AUTO", "AUTO.8", "LOITER", "TERMINATION"):
