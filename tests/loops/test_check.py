@@ -173,6 +173,11 @@ def test_without_a_receiver_its_failsafes_count() -> None:
     assert rows["FS_OPTIONS"].commands == ("--set FS_OPTIONS=24",)
     accepted = bench.check(contract=Contract(), accept_risk=("no-throttle-failsafe",))
     assert accepted["FS_THR_ENABLE"].verdict == "warn"
+    bench.check(contract=Contract(), echo_test=True)  # its sticks stay, and look like a receiver
+    bench.clock.sleep_until_ns(bench.clock.now_ns() + 5 * NS_PER_S)
+    assert bench.check(contract=Contract())["FS_THR_ENABLE"].verdict == "no-go"
+    seen = Bench(params=SAFE | {"FS_THR_ENABLE": 0}).check(contract=Contract())
+    assert seen["radio receiver"].verdict == "go"
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])

@@ -160,6 +160,10 @@ class ArduPilot(Profile):
         """True if bit 0 of RC_OPTIONS is set."""
         return bool(int(values.get("RC_OPTIONS", 0)) & _IGNORE_RECEIVER)
 
+    def keeps_sticks(self, values: Mapping[str, float]) -> bool:
+        """True without the throttle failsafe (FS_THR_ENABLE 0)."""
+        return values.get("FS_THR_ENABLE") == 0
+
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
         """Return "Simple mode off": without it the mode stays on until the mode switch moves."""
         if is_simple_setting(name, before) and not is_simple_setting(name, now):

@@ -259,6 +259,10 @@ class Profile(ABC):
         """True if the vehicle ignores the sticks of a receiver, even if there is one."""
         return False
 
+    def keeps_sticks(self, values: Mapping[str, float]) -> bool:
+        """True if overrides that have ended are shown for ever, as from a healthy receiver."""
+        return False
+
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
         """Return the command that a parameter change for a flight needs to take effect, or None."""
         return None

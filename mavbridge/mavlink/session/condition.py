@@ -44,6 +44,8 @@ class VehicleCondition:
         self._min_battery_percent = min_battery_percent
         self.calibration: RcCalibration | None = None
         """Radio calibration of the flight, if sticks pass through one."""
+        self.keeps_sticks = False
+        """True if overrides that have ended go on to look like a healthy receiver."""
         self.heartbeat: tuple[int, Heartbeat] | None = None
         self._custom_mode = 0
         self._mode_ns: int | None = None
@@ -132,7 +134,9 @@ class VehicleCondition:
         # Without a calibration, the sticks are by convention the first four channels.
         channels_us = rc.channels_us[:4] if pwm_us is None else pwm_us
         if not self.is_receiver_hidden and channels_us:
-            self._is_rc_plausible = all(value_us in RADIO_US for value_us in channels_us)
+            radio = [value_us for value_us in rc.channels_us if value_us in RADIO_US]
+            has_more = len(radio) > len(channels_us) or not self.keeps_sticks
+            self._is_rc_plausible = has_more and all(us in RADIO_US for us in channels_us)
         if self.is_released and self.has_receiver:
             self._pilot_sticks = self._rc_sticks
 

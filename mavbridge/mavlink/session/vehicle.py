@@ -188,6 +188,7 @@ class VehicleSession:
         self._streams.receive(message.name, arrived_ns)
         body = message.body
         self.condition.calibration = self.params.calibration
+        self.condition.keeps_sticks = self.profile.keeps_sticks(self.params.values)
         self.condition.receive(body, arrived_ns)
         match body:
             case Attitude():
