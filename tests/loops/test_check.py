@@ -201,6 +201,12 @@ def test_a_vehicle_that_obeys_another_system_fails_the_echo_test() -> None:
         assert "--set-config link.source_system=42" in rows[name].commands
 
 
+def test_a_vehicle_that_answers_nothing_is_one_no_go() -> None:
+    rows = Bench(params={"MAV_OPTIONS": 1, "MAV_GCS_SYSID": 42}).check(echo_test=True)
+    assert [name for name, verdict in verdicts(rows).items() if verdict == "no-go"] == ["vehicle"]
+    assert "MAV_OPTIONS bit 0" in rows["vehicle"].advice
+
+
 def test_without_the_flag_nothing_is_sent_but_requests() -> None:
     bench = Bench(params=SAFE)
     sent = bench.log_sent()

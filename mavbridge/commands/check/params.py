@@ -36,6 +36,8 @@ class Terms:
     """None: no policy."""
     vehicle: VehicleSession
     has_receiver: bool | None
+    is_deaf: bool
+    """True if the vehicle has answered nothing: no parameter, version or TIMESYNC."""
 
     @property
     def profile(self) -> Profile:

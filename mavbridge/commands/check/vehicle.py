@@ -61,6 +61,11 @@ _TEXTS_SHOWN = 4
 REFUSES_TO_ARM = "PreArm"
 """Prefix of ArduPilot's texts about its pre-arm checks."""
 _FLOWN = "ArduCopter or a PX4 multicopter"
+_DEAF = (
+    "the vehicle answers nothing that we send: our transmit line is dead, or it obeys only another "
+    "system id (MAV_OPTIONS bit 0, SYSID_ENFORCE up to 4.6: see link.source_system) or signed "
+    "packets (--signing-key-file)"
+)
 _link_row = partial(CheckRow, "link")
 _row = partial(CheckRow, "vehicle")
 
@@ -191,13 +196,14 @@ def check_vehicle(
                 plan=plan,
                 vehicle=vehicle,
                 has_receiver=snapshot.status.has_receiver if snapshot.status else None,
+                is_deaf=not (vehicle.version or vehicle.known_params or stats.rtt_ms),
             )
             rows += _link_rows(vehicle, stats, terms, unfinished)
-            if echo_test:
+            if echo_test and not terms.is_deaf:
                 rows.append(_echo_row(probe, terms))
             rows += _vehicle_rows(vehicle, snapshot.status, terms)
             rows += _text_rows(texts)
-            rows += param_rows(terms)
+            rows += [] if terms.is_deaf else param_rows(terms)
     except MavbridgeError as error:
         rows.append(_link_row("vehicle", "none that can be flown", _FLOWN, no_go=str(error)))
     return rows
@@ -208,11 +214,12 @@ def _link_rows(
 ) -> Iterator[CheckRow]:
     place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
     no_go = "" if unfinished is None else f"the set-up of the link did not finish: {unfinished}"
+    no_go = _DEAF if terms.is_deaf else no_go
     found = f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}"
     yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
     rates_hz = dict(stats.messages_per_s)
     for group in terms.streams:
-        if group.is_needed:
+        if group.is_needed and not terms.is_deaf:
             yield _rate_row(group, rates_hz, terms.plan)
     lost = stats.lost_fraction or 0.0
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""

@@ -174,7 +174,7 @@ def _require(values: Mapping[str, float], name: str) -> float:
     if name not in values:
         raise ValueError(
             f"the vehicle has not sent parameter {name}, which is asked for again; does it have RC "
-            "input?"
+            "input, and answer anything (mavbridge check)?"
         )
     return values[name]
 
