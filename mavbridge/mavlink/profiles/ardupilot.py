@@ -68,7 +68,7 @@ _FIRST_NAMES = (
     *_RISK_NAMES,
     "FLTMODE_CH",
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
-    *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER"),
+    *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER", "Q_ENABLE"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
     *_OLD_NAMES,
     *_OLD_NAMES.values(),
@@ -172,6 +172,9 @@ class ArduPilot(Profile):
 
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """See `Profile`."""
+        if "Q_ENABLE" in values:  # with Q_MAV_TYPE 2 its heartbeat is a quadrotor's
+            said = "this is an ArduPlane, and only the modes of ArduCopter are known"
+            yield ParamNote("obstacle", ("Q_ENABLE",), said)
         if context.output == "rc-override":
             yield from _override_notes(values, context, self.override_switch(values))
         elif context.output is not None:

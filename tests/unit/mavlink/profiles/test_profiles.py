@@ -133,6 +133,8 @@ def test_advice(
         ({"GUID_OPTIONS": 1.0}, "rates", "--set GUID_OPTIONS=9"),
         ({"GUID_OPTIONS": 9.0}, "rates", None),
         ({"GUID_OPTIONS": 0.0}, "velocity", None),
+        ({"Q_ENABLE": 1.0}, "velocity", "an ArduPlane"),
+        ({"Q_ENABLE": 0.0}, "rc-override", "an ArduPlane"),
         ({"MAV_GCS_SYSID": 255.0}, "rc-override", None),
         ({"MAV_GCS_SYSID": 42.0}, "rc-override", "--set-config link.source_system=42"),
         ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 255.0}, "rc-override", None),
