@@ -119,10 +119,9 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
     The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
-    was disarmed, rebooted, is in a failsafe that changes the mode (PX4: in any) or follows sticks
-    other than ours; the override switch is low; the engage switch is low (in flight, or while an
-    engage command is carried out); the vehicle is silent while another one uses its system id; or a
-    relevant parameter was changed.
+    was disarmed, rebooted, is in a failsafe that changes the mode (PX4: any) or follows other
+    sticks; the override switch is low; the engage switch is low (in flight or while engaging); the
+    vehicle is silent while another one uses its system id; or a relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -174,7 +173,7 @@ def fault(m: Memory, now: EngagementInputs) -> EndRequest | None:
     malformed chunks (NaN) in a second; the envelope was left; the link was lost; the system has
     refused our packets for 100 ms; the vehicle does not hear our sticks; a command could not be
     encoded; the vehicle's clock was set back; the vehicle sends from another address; or ArduPilot
-    is in a failsafe that keeps the mode.
+    keeps the mode in a failsafe.
     """
     problem = now.link.problem or now.chunk_fault or now.envelope_problem
     reason = problem or _failsafe(m, now, keeps_mode=True)
@@ -235,8 +234,8 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
     """it would keep following our last setpoint
 
     It is still armed in a mode that follows setpoints, on PX4 without a failsafe, and follows no
-    other source. After a release it would hold the last setpoint for up to 3 s, and sticks do
-    nothing in that mode.
+    other source. Released, it would hold the last setpoint for up to 3 s, and sticks do nothing in
+    that mode.
     """
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
