@@ -51,7 +51,14 @@ class Terms:
         kind: ActionKind = "sticks" if self.contract is None else self.contract.action
         output = self.profile.outputs[kind] if link.output == "auto" else link.output
         serial = serial_dangers(self.settings, self.streams)
-        return ParamContext(output, link.source_system, self.has_receiver, link.accept_risk, serial)
+        return ParamContext(
+            output,
+            link.source_system,
+            self.has_receiver,
+            self.vehicle.version,
+            link.accept_risk,
+            serial,
+        )
 
     @cached_property
     def values(self) -> dict[str, float]:

@@ -196,7 +196,7 @@ def check_vehicle(
                 plan=plan,
                 vehicle=vehicle,
                 has_receiver=snapshot.status.has_receiver if snapshot.status else None,
-                is_deaf=not (vehicle.version or vehicle.known_params or stats.rtt_ms),
+                is_deaf=not (vehicle.version or vehicle.params.values or stats.rtt_ms),
             )
             rows += _link_rows(vehicle, stats, terms, unfinished)
             if echo_test and not terms.is_deaf:

@@ -181,6 +181,8 @@ class ParamContext(NamedTuple):
     """Our MAVLink system id."""
     has_receiver: bool | None
     """As in ``VehicleStatus``."""
+    version: str | None = None
+    """Version of the firmware, like 1.18.0; None: unknown."""
     accepted_risks: tuple[Risk, ...] = ()
     serial: tuple[Danger, ...] = ()
     """Dangers of the serial port."""

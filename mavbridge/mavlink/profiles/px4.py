@@ -230,7 +230,7 @@ class Px4(Profile):
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """See `Profile`."""
         if context.output == "manual-control":
-            yield from _stick_notes(values)
+            yield from _stick_notes(values, context.version)
             yield from _end_notes(values, "COM_RC_LOSS_T", "NAV_RCL_ACT", _FATAL_ACTIONS)
             yield from _exception_notes(values, _EXCEPT_HOLD, "AUTO")
         elif context.output is not None:
@@ -332,21 +332,21 @@ def _lean(tilt_deg: float, *, is_tangent: bool) -> Lean:
     return Lean(axis, axis, full, is_tangent, "MPC_MAN_TILT_MAX")
 
 
-def _stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """Yield settings that refuse, weaken or change sticks, and gestures a policy might make."""
+def _stick_notes(values: Mapping[str, float], version: str | None) -> Iterator[ParamNote]:
+    """Yield what refuses, weakens or changes sticks, and gestures a policy might make."""
+    # A build without tags is 0.0.0.
+    if version and [1] <= [int(part) for part in version.split(".")] < [1, 16]:
+        effect = "shows the throttle as -1000 to 1000, so that our sticks cannot be checked"
+        cure = "update it to 1.16 or later, or fly by setpoints"
+        yield ParamNote("obstacle", (), f"PX4 {version} {effect}: {cure}")
     if (time_s := values.get("MAN_KILL_GEST_T", -1.0)) >= 0:
         effect = ": both sticks held down and outwards stop the motors, in flight too"
         yield ParamNote.of("obstacle", "MAN_KILL_GEST_T", time_s, effect, -1)
     mode = values.get("COM_RC_IN_MODE", 1.0)
     if mode in _NO_MAVLINK_STICKS:
-        yield ParamNote.of(
-            "obstacle",
-            "COM_RC_IN_MODE",
-            mode,
-            f" ({_NO_MAVLINK_STICKS[int(mode)]})",
-            1,
-            " (MAVLink only), or 6 with a receiver (MAVLink first)",
-        )
+        why = f" ({_NO_MAVLINK_STICKS[int(mode)]})"
+        or_else = " (MAVLink only), or 6 with a receiver (MAVLink first; PX4 1.17 and later)"
+        yield ParamNote.of("obstacle", "COM_RC_IN_MODE", mode, why, 1, or_else)
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
         effect = (

@@ -16,6 +16,7 @@ from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
+    AutopilotVersion,
     Body,
     CommandAck,
     CommandRequest,
@@ -272,6 +273,18 @@ def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
         status = session.status
         told = (status.mode, status.armed and "armed", status.is_failsafe and "failsafe")
         assert " ".join(filter(None, told)) == expected
+
+
+@pytest.mark.parametrize(
+    ("version", "code"),
+    [("1.15.4", Code.OBSTACLE), *((v, None) for v in ("1.16.0", "1.18.0", "0.0.0"))],
+)
+def test_sticks_need_a_px4_that_shows_the_throttle_as_it_was_sent(
+    version: str, code: Code | None
+) -> None:
+    session = Session("px4")
+    session.put(AutopilotVersion(version))
+    assert (session.problem and session.problem.code) == code
 
 
 def test_px4s_events_without_a_text_are_shown() -> None:

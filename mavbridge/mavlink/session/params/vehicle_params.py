@@ -100,6 +100,8 @@ class VehicleParams:
         self._config = config
         self._report = report
         self._output: Output | None = None
+        self.version: str | None = None
+        """Version of the firmware; None until it is read."""
         self._serial = serial_dangers(config, streams)
         self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
@@ -171,7 +173,12 @@ class VehicleParams:
     def _context(self, status: VehicleStatus | None) -> ParamContext:
         has_receiver, config = None if status is None else status.has_receiver, self._config
         return ParamContext(
-            self._output, config.source_system, has_receiver, config.accepted_risks, self._serial
+            self._output,
+            config.source_system,
+            has_receiver,
+            self.version,
+            config.accepted_risks,
+            self._serial,
         )
 
     def _assess(self, status: VehicleStatus | None) -> Assessment:
