@@ -49,7 +49,7 @@ class FlightData:
     """For messages, e.g. the folder."""
     state_frame: StateFrame
     tick_ns: Nanoseconds
-    """[T] ticks of the policy: image age and action history are relative to these."""
+    """[T] decisions of the policy: image age and action history are relative to these."""
     state: FloatArray
     """[T, 13] state as flown; NaN if it is unknown or must not be imitated."""
     attitude_ns: Nanoseconds
@@ -64,7 +64,7 @@ class FlightData:
     sent: FloatArray
     """[S, 4] sticks that flew, each until the next; centred if none, and in flights by rates."""
     age_ns: Nanoseconds
-    """[A] measured ages of the image at a tick; may be empty."""
+    """[A] measured ages of the image at a decision; may be empty."""
     captured_ns: Nanoseconds
     """[N] exposures."""
     gate: FloatArray

@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
@@ -31,7 +32,7 @@ VIDEO = "camera.mp4"
 
 _TICK_COLUMNS = (
     *("woke_ns", "sent_ns", "feature_captured_ns", "state", "attitude_ns", "velocity_ns"),
-    *("sent", "rc_sticks", "armed", "phase", "mode"),
+    *("chunk_computed_ns", "predict_ns", "sent", "rc_sticks", "armed", "phase", "mode"),
 )
 _FRAME_COLUMNS = ("captured_ns",)
 
@@ -130,11 +131,11 @@ def read_flight(folder: Path) -> FlightData:
     if not len(places):
         raise DatasetError(why_unreadable(video, ValueError("there is no whole image in it")))
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
-    tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
+    tick_ns, sent_ns = _decisions(name, ticks), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
     sent, target, is_target = _sticks(name, meta, ticks, contract)
     # The expert observed at the policy's tick; its stick is for that time.
-    target_ns = tick_ns if "expert" in ticks.column_names else sent_ns
+    target_ns = stamps(name, ticks, "woke_ns") if "expert" in ticks.column_names else sent_ns
     if contract.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(contract))
@@ -220,10 +221,9 @@ def _corrections(
 
 
 def read_ages(folder: Path) -> Nanoseconds:
-    """Return the sorted image ages that were measured at the ticks of a flight."""
+    """Return the sorted image ages that were measured at the decisions of a flight."""
     _read_meta(folder)
-    ticks, _ = _read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])
-    ages = _ages(str(folder), ticks)
+    ages = _ages(str(folder), _read_table(folder, "ticks", _TICK_COLUMNS, [])[0])
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
@@ -299,10 +299,20 @@ def _stamps_or(
     return out
 
 
+def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
+    """Return when the solve behind each tick began, by its inputs; the tick's time without one.
+
+    A tick without a solve counts as no later than the decisions after it.
+    """
+    started = pc.subtract(ticks["chunk_computed_ns"], ticks["predict_ns"])
+    at_ns = pc.coalesce(started, pa.array(stamps(name, ticks, "woke_ns"))).to_numpy()
+    return np.minimum.accumulate(at_ns[::-1])[::-1]
+
+
 def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
-    """Return the image's age at each tick that had one."""
-    looked = ticks.filter(ticks["feature_captured_ns"].is_valid())
-    return stamps(name, looked, "woke_ns") - stamps(name, looked, "feature_captured_ns")
+    """Return the image's age at the decision behind each tick that had one."""
+    age = pc.subtract(pa.array(_decisions(name, ticks)), ticks["feature_captured_ns"])
+    return np.asarray(age.drop_null(), np.int64)
 
 
 def _known(values: FloatArray) -> NDArray[np.bool_]:

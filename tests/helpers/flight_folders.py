@@ -37,6 +37,7 @@ def ticks_table(
     sent: Sequence[Sequence[float] | None],
     state: Sequence[Sequence[float] | None] | None = None,
     captured_ns: Sequence[int | None] | None = None,
+    solved_ns: Sequence[tuple[int | None, int | None]] | None = None,
     attitude_lag_ns: int = 0,
     sent_lag_ns: int = 0,
     armed: Sequence[bool] | None = None,
@@ -48,9 +49,12 @@ def ticks_table(
     state = [LEVEL] * count if state is None else state
     pairs = zip(woke_ns, state, strict=True)
     attitude_ns = [None if s is None else w - attitude_lag_ns for w, s in pairs]
+    computed_ns, predict_ns = zip(*(solved_ns or [(None, None)] * count), strict=True)
     columns = {
         "woke_ns": pa.array(woke_ns, pa.int64()),
         "sent_ns": pa.array([w + sent_lag_ns for w in woke_ns], pa.int64()),
+        "chunk_computed_ns": pa.array(computed_ns, pa.int64()),
+        "predict_ns": pa.array(predict_ns, pa.int64()),
         "feature_captured_ns": pa.array(captured_ns or [None] * count, pa.int64()),
         "state": pa.array(state, _STATE),
         "attitude_ns": pa.array(attitude_ns, pa.int64()),

@@ -27,7 +27,7 @@ from mavbridge.commands.imagine.loop import (
 from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -208,10 +208,11 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     # The newest state known at each exposure.
     known = np.searchsorted(state_ns, captured_ns[frames], side="right") - 1
     for row, at_ns in zip(known, captured_ns[frames], strict=True):
-        if row < 0 or at_ns - state_ns[row] > MAX_STATE_AGE_NS:
+        if (age_ns := at_ns - state_ns[row]) > MAX_STATE_AGE_NS:
             raise UserError(
-                f"--start {flight.folder} has no state of the vehicle there, at "
-                f"{(at_ns - state_ns[0]) / NS_PER_S:.2f} s: choose another --start-at"
+                f"--start {flight.folder}: at {(at_ns - state_ns[0]) / NS_PER_S:.2f} s its newest "
+                f"state is {age_ns / NS_PER_MS:.0f} ms old (limit {MAX_STATE_AGE_NS // NS_PER_MS} "
+                "ms): choose another --start-at, or the flight of a faster policy"
             )
     return RolloutStart(
         images=_start_images(flight, frames, config.image_size),

@@ -72,6 +72,13 @@ def test_a_start_within_a_gap_of_the_camera_is_refused(flight: Path) -> None:
     assert read_start(gap, TINY, 0.3).newest_ns < read_start(gap, TINY, 0.6).newest_ns
 
 
+def test_a_start_from_a_state_that_is_too_old_is_refused_with_its_age(flight: Path) -> None:
+    opened = open_flight(flight)
+    slow = replace(opened, ticks=opened.ticks.take([*range(0, 100, 25)]))
+    with pytest.raises(UserError, match=r"at 0.20 s its newest state is 200 ms old \(limit 100 ms"):
+        read_start(slow, TINY, 0.2)
+
+
 def test_a_policy_by_body_rates_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", action="rates")
     with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):

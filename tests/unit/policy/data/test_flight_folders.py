@@ -61,6 +61,24 @@ def test_expert_is_imitated_where_there_is_one(tmp_path: Path) -> None:
         read_ages(flight(tmp_path / "b"))
 
 
+def test_a_tick_counts_as_the_decision_behind_it_and_as_no_later_than_the_next(
+    tmp_path: Path,
+) -> None:
+    """Otherwise a history would hold the labels: the state is that of the decision."""
+    folder = flight(
+        tmp_path / "a",
+        woke_ns=[100 * MS, 200 * MS, 210 * MS, 220 * MS],
+        expert=None,
+        sent=[STICK] * 4,
+        captured_ns=[None, 40 * MS, None, 140 * MS],
+        solved_ns=[(None, None), (90 * MS, 40 * MS), (90 * MS, 40 * MS), (215 * MS, 45 * MS)],
+    )
+    read = read_flight(folder)
+    assert read.tick_ns.tolist() == [50 * MS, 50 * MS, 50 * MS, 170 * MS]
+    assert read.age_ns.tolist() == read_ages(folder).tolist() == [10 * MS, 30 * MS]
+    assert read.target_ns.tolist() == [100 * MS, 200 * MS, 210 * MS, 220 * MS]
+
+
 def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path) -> None:
     armed = [False, True, True]
     episode = read_flight(flight(tmp_path / "a", expert=None, armed=armed, sent_lag_ns=MS))
