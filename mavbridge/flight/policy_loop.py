@@ -16,7 +16,12 @@ from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.forward_state import ForwardState
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.flight.state import FrozenStateCheck, Observation, ObservationSource
+from mavbridge.flight.state import (
+    FrozenStateCheck,
+    Observation,
+    ObservationSource,
+    observation_ages_ns,
+)
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
@@ -74,6 +79,7 @@ class PolicyLoop:
         one."""
         self._forward = ForwardState(contract) if contract.state_time == "execution" else None
         """Predicts the state to the time at which the chunk acts."""
+        self._before_ns = observation_ages_ns(contract)
         self._frozen = FrozenStateCheck(
             max_frozen_ns=round(plan.config.limits.max_frozen_state * NS_PER_S)
         )
@@ -164,16 +170,21 @@ class PolicyLoop:
         self._observations.push(state)
         if (frozen := self._frozen.problem(state)) is not None:
             return frozen
+        predicted: list[VehicleState] = []
         if self._forward is not None and plan is not None:
-            acts_ns = self._takeover_ns(now_ns)
-            ahead = self._forward.at(telemetry, acts_ns, partial(self._view.history.at, plan=plan))
-            if ahead is not telemetry:
+            acts_ns, flown_at = self._takeover_ns(now_ns), partial(self._view.history.at, plan=plan)
+            for before_ns in self._before_ns:
+                at_ns = acts_ns - before_ns
+                ahead = self._forward.at(telemetry, at_ns, flown_at)
+                if ahead is telemetry:  # measured by then, or the vehicle stands still
+                    continue
                 has_position = self._view.status.has_position
-                acting = self._view.reader.read(ahead, acts_ns, has_position=has_position)
+                acting = self._view.reader.read(ahead, at_ns, has_position=has_position)
                 if isinstance(acting, Reason):
                     return acting
-                state = acting
-        return self._observations.observe(state, now_ns)
+                predicted.append(acting)
+        state = predicted.pop() if predicted else state
+        return self._observations.observe(state, now_ns, predicted)
 
     def _takeover_ns(self, now_ns: int) -> int:
         """Return when the chunk of a solve that begins now will take over, by the last solves."""

@@ -231,8 +231,13 @@ class ObservationSource:
         ):
             states.popleft()
 
-    def observe(self, state: VehicleState, now_ns: int) -> Observation | Reason:
-        """Return the inputs of a chunk from ``state``, the newest pushed, or why one is missing."""
+    def observe(
+        self, state: VehicleState, now_ns: int, predicted: Sequence[VehicleState] = ()
+    ) -> Observation | Reason:
+        """Return the inputs of a chunk from ``state``, or why one is missing.
+
+        ``state`` is the newest pushed; or it is predicted, after the ``predicted`` ones.
+        """
         newest = []
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
@@ -255,18 +260,23 @@ class ObservationSource:
         ]
         return Observation(
             encoded=self._join([[feature.value for feature in row] for row in rows]),
-            states=self._rows(state, [row[0] for row in rows]),
+            states=self._rows(state, predicted, [row[0] for row in rows]),
             state=state,
             captured_ns=newest[0].captured_ns,
             image_ns=min(feature.captured_ns for feature in newest),
             frame_ids=tuple(tuple(feature.frame_id for feature in row) for row in rows),
         )
 
-    def _rows(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
+    def _rows(
+        self,
+        state: VehicleState,
+        predicted: Sequence[VehicleState],
+        features: Sequence[FeatureFrame],
+    ) -> FloatArray:
         """Return the states at the observations; ``features`` are the first camera's."""
         if len(self._before_ns) == 1:
             return self._with_motion(state, features[0])
-        known = (*self._states, state)
+        known = (*self._states, *predicted, state)
         rows = []
         for before_ns, feature in zip(self._before_ns, features, strict=True):
             at_ns = state.attitude_ns - before_ns

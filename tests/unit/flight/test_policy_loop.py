@@ -159,6 +159,19 @@ def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
     assert history[0, -1].tolist() == [0.0, 0.0, pytest.approx(0.8), 0.0]
 
 
+def test_past_states_are_predicted_too_where_none_is_measured_yet() -> None:
+    pitch = np.tile(np.array([0.0, 0.0, 0.8, 0.0], np.float32), (1, 16, 1))
+    steps = {"observation_steps": 4, "observation_dt_s": 0.08}
+    rig = Rig(lambda: pitch, 200, horizon=16, state_time="execution", **steps).measure().see()
+    rig.north_mps, rig.solve_ns = 2.0, 200 * MS
+    rig.loop.step()
+    rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
+    run_on(rig, 7)
+    _, states, _ = rig.given
+    # 40 ms before now, where the measured state is the nearest, and 40, 120 and 200 ms after it.
+    assert 2.0 == states[0, 0, 0] < states[0, 1, 0] < states[0, 2, 0] < states[0, 3, 0]
+
+
 def test_the_prefix_holds_what_flies_until_the_chunk_takes_over() -> None:
     rising = np.zeros((1, 16, 4), np.float32)
     rising[0, :, 0] = np.arange(16) / 100
