@@ -3,14 +3,21 @@
 import threading
 from bisect import bisect_right
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.limits import ActionSmoother
+from mavbridge.guard.settings import FlightSettings
 from policy.contract import history_ages_ns
+
+REPORTED_NS = 10 * NS_PER_MS
+"""Age of a sent action from which the guard has reported it, in flight as in a replay."""
 
 
 def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks:
@@ -57,33 +64,46 @@ class SentHistory:
             if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
                 del self._sent_ns[: old - 1], self._sent[: old - 1]
 
-    def at(self, at_ns: int, plan: Chunk | None = None) -> Action:
+    def at(self, at_ns: int) -> Action:
         """Return the action flown at a time, of the policy's kind, in NED and FRD axes.
 
         An action of another kind is neutral: while it prepares the vehicle, or levels one that is
-        flown by body rates, the guard sends actions that the policy does not know. ``plan``: chunk
-        that is flown from the end of its solve on.
+        flown by body rates, the guard sends actions that the policy does not know.
         """
-        if plan is not None and at_ns >= plan.computed_ns:
-            return plan.action_at(at_ns)
         with self._lock:
             action = self._sent[bisect_right(self._sent_ns, at_ns)]
         return action if type(action) is type(self._frame.neutral) else self._frame.neutral
 
+    def foreseen(
+        self, plan: Chunk, guard: FlightSettings, now_ns: int, until_ns: int
+    ) -> "SentHistory":
+        """Return a copy that goes on until ``until_ns`` as the guard will send ``plan``."""
+        ahead = copy(self)
+        with self._lock:
+            known = bisect_right(self._sent_ns, now_ns - REPORTED_NS)
+            ahead._sent_ns, ahead._sent = self._sent_ns[:known], self._sent[: known + 1]
+        first_ns = max([plan.computed_ns, *ahead._sent_ns[-1:]])
+        smoother = ActionSmoother(guard.smoothing, ahead.at(first_ns))
+        lead_ns = round(guard.smoothing.tau_s * NS_PER_S)
+        for at_ns in range(first_ns, until_ns, guard.stick_period_ns):
+            ahead._sent_ns.append(at_ns)
+            ahead._sent.append(smoother.step(plan.action_at(at_ns + lead_ns), at_ns).smoothed)
+        return ahead
+
     def committed(self, plan: Chunk | None, times_ns: Sequence[int], until_ns: int) -> FloatArray:
-        """Return the actions [1, len(times_ns), 4] that fly at these times; NaN from ``until_ns``
-        on, and without a ``plan``."""
+        """Return the actions [1, len(times_ns), 4] that fly at these times, those of the ``plan``
+        unfiltered; NaN from ``until_ns`` on, and without a plan."""
         prefix = np.full((1, len(times_ns), 4), np.nan, np.float32)
         soon_ns = [] if plan is None else [at_ns for at_ns in times_ns if at_ns < until_ns]
-        if soon_ns:
-            flown = [self.at(at_ns, plan) for at_ns in soon_ns]
+        if plan is not None and soon_ns:
+            flown = [
+                plan.action_at(at_ns) if at_ns >= plan.computed_ns else self.at(at_ns)
+                for at_ns in soon_ns
+            ]
             prefix[0, : len(flown)] = self._frame.from_guard(flown)
         return prefix
 
-    def resample(self, at_ns: int, plan: Chunk | None = None) -> FloatArray:
-        """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``.
-
-        ``plan``: as in ``at``, for a time that is still to come.
-        """
-        rows = [self.at(at_ns - age_ns, plan) for age_ns in self._ages_ns]
+    def resample(self, at_ns: int) -> FloatArray:
+        """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``."""
+        rows = [self.at(at_ns - age_ns) for age_ns in self._ages_ns]
         return self._frame.from_guard(rows)[None]

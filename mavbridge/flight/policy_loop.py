@@ -4,7 +4,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from mavbridge.core.vehicle import Telemetry
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.forward_state import ForwardState
+from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.state import (
     FrozenStateCheck,
@@ -72,6 +72,7 @@ class PolicyLoop:
         self._send = send
         self._watch = watch
         self._action_frame = action_frame(contract)
+        self._guard = plan.guard
         self._step_ns = round(contract.chunk_dt_s * NS_PER_S)
         self._prefix_len = contract.prefix_len
         self._period_ns = plan.guard.chunk_period_ns
@@ -158,28 +159,32 @@ class PolicyLoop:
             self._refuse(state)
             return
         plan = self._chunk if self._view.phase is Phase.FLYING else None
-        observation = self._observe(state, telemetry, now_ns, plan)
+        ahead: SentHistory | None = None
+        if self._forward is not None and plan is not None:
+            acts_ns = self._takeover_ns(now_ns)
+            ahead = self._view.history.foreseen(plan, self._guard, now_ns, acts_ns)
+        observation = self._observe(state, telemetry, now_ns, ahead)
         if isinstance(observation, Reason):
             self._refuse(observation)
         else:
-            self._solve(state, observation, now_ns, plan)
+            self._solve(state, observation, now_ns, plan, ahead)
 
     def _observe(
-        self, state: VehicleState, telemetry: Telemetry, now_ns: int, plan: Chunk | None
+        self, state: VehicleState, telemetry: Telemetry, now_ns: int, ahead: SentHistory | None
     ) -> Observation | Reason:
         self._observations.push(state)
         if (frozen := self._frozen.problem(state)) is not None:
             return frozen
         predicted: list[VehicleState] = []
-        if self._forward is not None and plan is not None:
-            acts_ns, flown_at = self._takeover_ns(now_ns), partial(self._view.history.at, plan=plan)
+        if self._forward is not None and ahead is not None:
+            acts_ns = self._takeover_ns(now_ns)
             for before_ns in self._before_ns:
                 at_ns = acts_ns - before_ns
-                ahead = self._forward.at(telemetry, at_ns, flown_at)
-                if ahead is telemetry:  # measured by then, or the vehicle stands still
+                then = self._forward.at(telemetry, at_ns, ahead.at)
+                if then is telemetry:  # measured by then, or the vehicle stands still
                     continue
                 has_position = self._view.status.has_position
-                acting = self._view.reader.read(ahead, at_ns, has_position=has_position)
+                acting = self._view.reader.read(then, at_ns, has_position=has_position)
                 if isinstance(acting, Reason):
                     return acting
                 predicted.append(acting)
@@ -198,15 +203,21 @@ class PolicyLoop:
         self._send(reason)
 
     def _solve(
-        self, state: VehicleState, observation: Observation, now_ns: int, plan: Chunk | None
+        self,
+        state: VehicleState,
+        observation: Observation,
+        now_ns: int,
+        plan: Chunk | None,
+        ahead: SentHistory | None,
     ) -> None:
-        """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured;
-        ``plan`` is the chunk that flies, if one does."""
+        """Compute and send a chunk.
+
+        ``observation`` may be predicted, ``state`` is as measured; ``plan`` is the chunk that
+        flies, if one does; ``ahead`` foresees its actions, for an observation that is predicted.
+        """
         acts_ns = observation.state.attitude_ns
-        if self._forward is None or plan is None:
-            history = self._view.history.resample(now_ns)
-        else:
-            history = self._view.history.resample(acts_ns, plan)
+        sent, at_ns = (self._view.history, now_ns) if ahead is None else (ahead, acts_ns)
+        history = sent.resample(at_ns)
         if self._prefix_len:
             times_ns = range(acts_ns, acts_ns + self._prefix_len * self._step_ns, self._step_ns)
             prefix = self._view.history.committed(plan, times_ns, self._takeover_ns(now_ns))

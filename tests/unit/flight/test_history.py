@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
 
+from helpers.factories import make_plan
+from helpers.guard_facts import make_chunk
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import IDLE, NEUTRAL, AttitudeThrust, BodyRates, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, AttitudeThrust, BodyRates, Sticks, Velocity
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory, sample_chunk
+from mavbridge.guard.limits import ActionSmoother
 from policy.contract import Contract
 
 CHUNK = np.array([[0, 0, 0, 0], [1, -1, 0.5, 0], [0, 0, 0, 1]], dtype=np.float32)
@@ -60,6 +63,25 @@ def test_what_was_sent_comes_back_in_the_policys_own_axes_and_kind() -> None:
     history.append(IDLE, 30 * NS_PER_MS)
     own = [0.25, 1, -2, 3]
     assert history.resample(40 * NS_PER_MS)[0].tolist() == [own, neutral, neutral, neutral]
+
+
+def test_what_is_foreseen_is_what_the_guard_will_send_and_what_was_sent_stays() -> None:
+    """Neither the 12 m/s of the plan, nor without the limit on its change."""
+    guard = make_plan(Contract(action="velocity")).guard
+    history = SentHistory(length=4, dt_s=0.05, frame=action_frame(Contract(action="velocity")))
+    history.append(Velocity(1.0, 0.0, 0.0, 0.0), 0)
+    plan = make_chunk(1, 0, first_ns=0, actions=(Velocity(12.0, 0.0, 0.0, 0.0),))
+    smoother, sent = ActionSmoother(guard.smoothing, Velocity(1.0, 0.0, 0.0, 0.0)), []
+    for at_ns in range(0, 1500 * NS_PER_MS, 10 * NS_PER_MS):
+        sent.append(smoother.step(plan.actions[0], at_ns).smoothed)
+        if at_ns <= 200 * NS_PER_MS:
+            history.append(sent[-1], at_ns)
+    ahead = history.foreseen(plan, guard, 205 * NS_PER_MS, 1500 * NS_PER_MS)
+    flown = [ahead.at(k * 10 * NS_PER_MS).x_mps for k in range(150)]
+    real = [action.x_mps for action in sent]
+    assert flown[:20] == real[:20]
+    assert np.abs(np.subtract(flown, real)).max() < 0.3
+    assert max(flown) <= 8.0
 
 
 def test_history_forgets_what_no_resample_can_reach() -> None:

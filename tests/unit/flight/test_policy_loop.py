@@ -13,7 +13,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import Reading, Sample, Telemetry, Velocity
+from mavbridge.core.vehicle import Reading, Sample, Sticks, Telemetry, Velocity
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
@@ -144,7 +144,8 @@ def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
     rig = Rig(lambda: pitch, 200, horizon=16, state_time="execution").measure().see()
     rig.north_mps, rig.solve_ns = north_mps, 200 * MS
     rig.loop.step()  # not flying yet: as measured
-    rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
+    sent = Sticks(0.0, 0.0, 0.8, 0.0)
+    rig.view.receive(make_guard_tick(START_NS + 190 * MS, phase=Phase.FLYING, sent=sent))
     run_on(rig, 7)
     _, chunk = rig.sent
     assert isinstance(chunk, Chunk)
