@@ -21,7 +21,6 @@ from mavbridge.mavlink.outputs.output import ActionOutput
 from mavbridge.mavlink.outputs.setpoints import VelocityOutput
 from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
 from mavbridge.mavlink.profiles.profile import Profile
-from mavbridge.mavlink.session.commands import mode_request
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import Connection
 
@@ -157,7 +156,7 @@ class ActionSender:
                 if packet is not None:
                     yield after_ns, packet
                 if mode is not None:
-                    request = mode_request(vehicle.profile.modes.command(mode))
+                    request = vehicle.profile.modes.command(mode)
                     yield after_ns, self._codec.encode_request(vehicle.identity.source, request)
 
     def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:

@@ -22,15 +22,13 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
 )
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
-    NO_HEALTH,
-    NO_LANDING,
-    NO_POSITION_WORD,
     Danger,
     ModeTable,
     ParamContext,
     ParamNote,
     Profile,
     StreamGroup,
+    condition_streams,
     long_timeout,
 )
 from mavbridge.mavlink.profiles.sticks import StickCurves
@@ -134,9 +132,7 @@ class ArduPilot(Profile):
             StreamGroup(("LOCAL_POSITION_NED",), state_hz, True, dialect.MAV_DATA_STREAM_POSITION),
             StreamGroup(imu, state_hz, True, dialect.MAV_DATA_STREAM_RAW_SENSORS),
             self.stick_echo._replace(rate_hz=pilot_hz or RC_CHANNELS_HZ),
-            StreamGroup(("SYS_STATUS",), 2.0, without=NO_HEALTH),
-            StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without=NO_LANDING),
-            StreamGroup(("EKF_STATUS_REPORT",), 5.0, without=NO_POSITION_WORD),
+            *condition_streams("EKF_STATUS_REPORT"),
             StreamGroup(("HEARTBEAT",), HEARTBEAT_HZ),
         )
 

@@ -41,8 +41,8 @@ class ModeTable:
         main = self._names.get(custom_mode & self._main_mask, str(custom_mode))
         return self._names.get(custom_mode, main)
 
-    def command(self, name: str) -> tuple[int, int]:
-        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE.
+    def command(self, name: str) -> CommandRequest:
+        """Return the request for a mode.
 
         Raises:
             UserError: the vehicle has no such mode.
@@ -52,7 +52,8 @@ class ModeTable:
             raise UserError(
                 f"this vehicle has no mode {name!r}; it has {', '.join(sorted(self._commands))}"
             )
-        return numbers
+        flag = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        return CommandRequest(dialect.MAV_CMD_DO_SET_MODE, (flag, *numbers))
 
 
 class StreamGroup(NamedTuple):
@@ -74,9 +75,15 @@ class StreamGroup(NamedTuple):
     """Message to request one at a time during its absence."""
 
 
-NO_LANDING = "a landing does not end the flight"
-NO_POSITION_WORD = "the loss of its position estimate is not seen"
-NO_HEALTH = "a low battery and a receiver that fails are not seen"
+def condition_streams(estimator: str) -> tuple[StreamGroup, ...]:
+    """Return the streams of health, landing and estimator, which a flight can do without."""
+    health = "a low battery and a receiver that fails are not seen"
+    position = "the loss of its position estimate is not seen"
+    return (
+        StreamGroup(("SYS_STATUS",), 2.0, without=health),
+        StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without="a landing does not end the flight"),
+        StreamGroup((estimator,), 5.0, without=position),
+    )
 
 
 HOME_HEIGHT = StreamGroup(("GLOBAL_POSITION_INT",), 20.0, least_hz=5.0)

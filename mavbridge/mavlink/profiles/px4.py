@@ -15,15 +15,13 @@ from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
-    NO_HEALTH,
-    NO_LANDING,
-    NO_POSITION_WORD,
     EventMeaning,
     ModeTable,
     ParamContext,
     ParamNote,
     Profile,
     StreamGroup,
+    condition_streams,
     long_timeout,
 )
 from mavbridge.mavlink.profiles.sticks import (
@@ -213,9 +211,7 @@ class Px4(Profile):
                 stand_in="HEARTBEAT",
             ),
             StreamGroup(("RC_CHANNELS",), pilot_hz or RC_CHANNELS_HZ, least_hz=0.0),
-            StreamGroup(("SYS_STATUS",), 2.0, without=NO_HEALTH),
-            StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without=NO_LANDING),
-            StreamGroup(("ESTIMATOR_STATUS",), 5.0, without=NO_POSITION_WORD),
+            *condition_streams("ESTIMATOR_STATUS"),
             StreamGroup(("GLOBAL_POSITION_INT",), 2.0, least_hz=0.0),
         )
 

@@ -20,11 +20,6 @@ _FORGET_NS = 3 * NS_PER_S
 """Time without requests for a mode after which its refusal is forgotten."""
 
 
-def mode_request(numbers: tuple[int, int]) -> CommandRequest:
-    """Return the request for a mode by its two numbers."""
-    return CommandRequest(_SET_MODE, (dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *numbers))
-
-
 class VehicleCommands:
     """Rate-limited requests to the present vehicle."""
 
@@ -54,7 +49,7 @@ class VehicleCommands:
         """
         if self._vehicle is None:
             return
-        request = mode_request(self._vehicle.profile.modes.command(mode))
+        request = self._vehicle.profile.modes.command(mode)
         now_ns = self._clock.now_ns()
         last_ns, last = self._sent.get(_SET_MODE, (now_ns, None))
         if mode != self._mode or now_ns - last_ns > _FORGET_NS:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.vehicle import Output
@@ -62,7 +63,8 @@ def test_every_role_is_a_mode_that_can_be_asked_for(profile: Profile) -> None:
     named = (roles.hold, roles.land, roles.rtl, *roles.takeoff, *roles.thrust, *roles.setpoint)
     assert set(named) <= set(roles.names)
     for name in roles.names:
-        main, sub = profile.modes.command(name)
+        command, (_, main, sub) = profile.modes.command(name)
+        assert command == dialect.MAV_CMD_DO_SET_MODE
         custom_mode = main if profile is ARDUPILOT else main << 16 | sub << 24
         assert profile.modes.name(custom_mode) == name
 
@@ -70,7 +72,7 @@ def test_every_role_is_a_mode_that_can_be_asked_for(profile: Profile) -> None:
 def test_modes_of_a_copter() -> None:
     modes = ARDUPILOT.modes
     assert modes.name(2) == "ALT_HOLD"
-    assert modes.command("alt_hold") == (2, 0)
+    assert modes.command("alt_hold") == (dialect.MAV_CMD_DO_SET_MODE, (1, 2, 0))
     assert modes.name(99) == "99"
     with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
         modes.command("HOVER")
