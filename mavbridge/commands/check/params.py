@@ -132,7 +132,7 @@ def param_rows(terms: Terms) -> Iterator[CheckRow]:
             )
     yield from _curve_rows(terms)
     if terms.contract is not None and terms.contract.action in ("rates", "attitude"):
-        hover = terms.profile.hover_thrust(terms.values)
+        hover = terms.values.get(terms.profile.hover_param)
         yield _row(
             "hover thrust",
             _NOT_SENT if hover is None else f"{hover:.2f}, thrusts are scaled by it",

@@ -62,11 +62,6 @@ class UnusableError(Exception):
     """Well-formed message with unusable values."""
 
 
-def _require_finite(value: float) -> None:
-    if not math.isfinite(value):
-        raise UnusableError
-
-
 def _require_usable(*values: float) -> None:
     if not max(map(abs, values)) <= MOST_VALUE or math.isnan(sum(values)):
         raise UnusableError
@@ -75,10 +70,6 @@ def _require_usable(*values: float) -> None:
 def _text(data: bytes) -> str:
     """Return a text up to its first zero byte, each byte as one character."""
     return data.split(b"\0", 1)[0].decode("ascii", errors="replace")
-
-
-def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
-    return Heartbeat(m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status)
 
 
 def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:
@@ -141,14 +132,10 @@ def _sys_status(m: dialect.MAVLink_sys_status_message) -> Body:
     return SystemStatus(present, m.onboard_control_sensors_health, m.battery_remaining)
 
 
-def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
-    target = Endpoint(m.target_system, m.target_component)
-    return CommandAck(command=m.command, result=m.result, target=target)
-
-
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
-    if m.param_type == dialect.MAV_PARAM_TYPE_REAL32:
-        _require_finite(m.param_value)  # the bytes of an integer may be those of NaN
+    # The bytes of an integer may be those of NaN.
+    if m.param_type == dialect.MAV_PARAM_TYPE_REAL32 and not math.isfinite(m.param_value):
+        raise UnusableError
     return ParamValue(name=_text(m.param_id), value=m.param_value, kind=m.param_type)
 
 
@@ -186,7 +173,9 @@ def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
 
 
 READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
-    "HEARTBEAT": _heartbeat,
+    "HEARTBEAT": lambda m: Heartbeat(
+        m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status
+    ),
     "ATTITUDE": _attitude,
     "ATTITUDE_QUATERNION": _attitude_quaternion,
     "LOCAL_POSITION_NED": _local_position,
@@ -207,7 +196,9 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "EXTENDED_SYS_STATE": lambda m: LandedState(m.landed_state),
     "EKF_STATUS_REPORT": lambda m: EstimatorFlags(m.flags),
     "ESTIMATOR_STATUS": lambda m: EstimatorFlags(m.flags),
-    "COMMAND_ACK": _command_ack,
+    "COMMAND_ACK": lambda m: CommandAck(
+        m.command, m.result, Endpoint(m.target_system, m.target_component)
+    ),
     "PARAM_VALUE": _param_value,
     "PARAM_ERROR": _param_error,
     "STATUSTEXT": _status_text,

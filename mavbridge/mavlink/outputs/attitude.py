@@ -202,7 +202,7 @@ class AttitudeOutput(SetpointOutput):
         return Encoded(packet, BodyRates(action.thrust, roll, pitch, yaw), shown)
 
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
-        hover = self._hover.value or vehicle.profile.hover_thrust(vehicle.params.values)
+        hover = self._hover.value or vehicle.params.values.get(vehicle.profile.hover_param)
         if hover is None or not PLAUSIBLE_THRUST[0] < hover < PLAUSIBLE_THRUST[1]:
             vehicle.report(
                 AdviceText(

@@ -220,7 +220,7 @@ class Profile(ABC):
     stick_echo: ClassVar[StreamGroup]
     """Message that shows the sticks that the vehicle acts on."""
     hover_param: ClassVar[str]
-    """Parameter of the hover thrust."""
+    """Parameter of the hover thrust in [0, 1], by the vehicle's own estimate."""
     boost_param: ClassVar[str | None] = None
     """Parameter that is not 0 if thrust is raised in a lean; None: it never is."""
     has_rc_channels_always: ClassVar[bool] = True
@@ -300,10 +300,6 @@ class Profile(ABC):
 
         Request it again when parameters or the mode change. ``gains`` None: sticks stay unchanged.
         """
-
-    def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """Return the hover thrust in [0, 1] by the vehicle's own estimate; None: unknown."""
-        return values.get(self.hover_param)
 
     def boosts_thrust(self, values: Mapping[str, float]) -> bool:
         """True if the vehicle divides a setpoint's thrust by the cosine of its tilt."""

@@ -261,7 +261,6 @@ def test_what_is_no_such_action_never_leaves() -> None:
 @BOTH
 def test_a_thrust_that_cannot_be_matched_to_the_vehicle_is_told_once(profile: Profile) -> None:
     flight = attitude_flight(profile)
-    assert flight.vehicle.profile.hover_thrust(flight.vehicle.params.values) is None
     flight.send(LEVEL)
     (note,) = flight.vehicle.texts
     assert "hovers is not known" in note
