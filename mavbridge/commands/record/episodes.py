@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shutil import disk_usage
 from typing import Literal, TypeAlias
@@ -125,8 +125,8 @@ class Episode:
     log: PacketPipe
     recorder: Recorder
     mark: Mark | None = None
-    _first_tick: int | None = None
-    _first_frame: int | None = None
+    _first: dict[type[Event], int] = field(default_factory=dict)
+    """Number of the first recorded tick, and of the first frame."""
 
     @property
     def meta(self) -> FlightMeta:
@@ -136,13 +136,10 @@ class Episode:
 
     def emit(self, event: Event) -> None:
         """Record events since the start of the episode, numbered from there."""
-        if isinstance(event, Tick):
-            if event.woke_ns >= self.begin_ns:
-                self._first_tick = event.serial if self._first_tick is None else self._first_tick
-                self.recorder.emit(replace(event, serial=event.serial - self._first_tick))
-        elif event.captured_ns >= self.begin_ns:
-            self._first_frame = event.serial if self._first_frame is None else self._first_frame
-            self.recorder.emit(replace(event, serial=event.serial - self._first_frame))
+        at_ns = event.woke_ns if isinstance(event, Tick) else event.captured_ns
+        if at_ns >= self.begin_ns:
+            first = self._first.setdefault(type(event), event.serial)
+            self.recorder.emit(replace(event, serial=event.serial - first))
 
 
 class Episodes:
