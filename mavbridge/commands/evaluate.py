@@ -2,7 +2,6 @@
 intervals."""
 
 import hashlib
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.output import make_table, progress_bar, text_console
+from mavbridge.commands.output import make_table, progress_bar, text_console, write_json
 from mavbridge.config.episodes import (
     COURSE_SEEDS,
     HELD_OUT_COURSE_SEED,
@@ -25,7 +24,7 @@ from mavbridge.config.episodes import (
 from mavbridge.config.rates import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.files import require_writable, write_output
+from mavbridge.core.files import require_writable
 from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.core.reasons import reason_from_json, reason_to_json
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -198,15 +197,15 @@ def evaluate(config: EvaluateConfig) -> int:
                             "another --json"
                         )
                     flown[index] = episode
-                    if config.resume and config.json is not None:
-                        write_output(config.json, to_json(config, flown, flown_by), "--json")
+                    if config.resume:
+                        write_json(config.json, as_document(config, flown, flown_by))
         except MavbridgeError as error:
             failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
     if flown:
         print_evaluation(config, flown, text_console())
-    if config.json is not None and (flown or failure is None):
-        write_output(config.json, to_json(config, flown, flown_by), "--json")
+    if flown or failure is None:
+        write_json(config.json, as_document(config, flown, flown_by))
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(f"{ended}{config.episodes} episodes", style="yellow")
@@ -311,8 +310,10 @@ def _from_json(document: dict[str, Any]) -> EpisodeResult:
     return EpisodeResult(**document | {"gate_times_s": times_s, "lost": lost})
 
 
-def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by: str) -> str:
-    """Return all results as JSON; the summary is null without episodes, ``flown_by`` from
+def as_document(
+    config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by: str
+) -> dict[str, object]:
+    """Return all results for ``--json``; the summary is null without episodes, ``flown_by`` from
     ``identity``."""
     episodes = _results(flown)
     summary: dict[str, object] | None = None
@@ -320,7 +321,7 @@ def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by:
         found = summarise(episodes).items()
         summary = {name: estimate and asdict(estimate) for name, estimate in found}
         summary["outcomes"] = _outcomes(episodes)
-    document = {
+    return {
         "policy": config.policy.policy,
         "engine": _engine(flown),
         "conditions": config.conditions,
@@ -332,7 +333,6 @@ def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by:
         "summary": summary,
         "episodes": [_as_json(one) for one in episodes],
     }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def print_evaluation(

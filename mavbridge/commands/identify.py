@@ -1,6 +1,5 @@
 """``mavbridge identify``: fly a doublet, and compare the vehicle with a policy's training."""
 
-import json
 import math
 from collections import deque
 from collections.abc import Callable
@@ -12,12 +11,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from mavbridge.commands.config import IdentifyConfig
-from mavbridge.commands.output import make_table, table_console
+from mavbridge.commands.output import make_table, table_console, write_json
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.files import empty_folders_removed, require_writable, write_output
+from mavbridge.core.files import empty_folders_removed, require_writable
 from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
 from mavbridge.flight.app import fly_policy
@@ -323,9 +322,11 @@ def print_identification(found: Identification, contract: Contract, console: Con
         console.print(f"not measured: {line}", style="yellow")
 
 
-def to_json(found: Identification, contract: Contract, config: IdentifyConfig) -> str:
-    """Return all results as JSON; a ratio is null if the policy expected no motion."""
-    document = {
+def as_document(
+    found: Identification, contract: Contract, config: IdentifyConfig
+) -> dict[str, object]:
+    """Return all results for ``--json``; a ratio is null if the policy expected no motion."""
+    return {
         "policy": config.flight.policy.policy,
         "action": contract.action,
         "trained_hover_thrust": contract.hover_thrust,
@@ -333,7 +334,6 @@ def to_json(found: Identification, contract: Contract, config: IdentifyConfig) -
         "pushes": [asdict(push) | {"ratio": push.ratio} for push in found.pushes],
         "missing": found.missing,
     }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def identify(config: IdentifyConfig) -> int:
@@ -354,8 +354,7 @@ def identify(config: IdentifyConfig) -> int:
     if not found.pushes:
         raise PeerError(f"nothing could be measured: {'; '.join(found.missing)}")
     print_identification(found, trained, table_console())
-    if config.json is not None:
-        write_output(config.json, to_json(found, trained, config), "--json")
+    write_json(config.json, as_document(found, trained, config))
     return 0
 
 

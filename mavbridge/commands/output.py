@@ -1,5 +1,6 @@
 """Output shared by the commands: tables, progress bars and figures."""
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from rich.progress import (
 from rich.table import Table
 
 from mavbridge.core.extras import require_packages
-from mavbridge.core.files import require_writable
+from mavbridge.core.files import require_writable, write_output
 from mavbridge.core.provenance import without_secrets
 
 PIPED_WIDTH = 120
@@ -43,16 +44,27 @@ FIGURE_STYLE: dict[Any, Any] = {
 }
 
 
-def require_outputs(json: Path | None, plot: Path | None) -> None:
+def require_outputs(json_file: Path | None, plot: Path | None) -> None:
     """Check the flags ``--json`` and ``--plot`` before a long run.
 
     Raises:
         UserError: a file cannot be written, or matplotlib is not installed.
     """
-    require_writable(json, "--json")
+    require_writable(json_file, "--json")
     require_writable(plot, "--plot")
     if plot is not None:
         require_packages("--plot", {"matplotlib": "matplotlib"})
+
+
+def as_json(document: object) -> str:
+    """Return the text of a ``--json`` file."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path | None, document: object) -> None:
+    """Write the file that ``--json`` names, if it names one."""
+    if path is not None:
+        write_output(path, as_json(document), "--json")
 
 
 def text_console(*, stderr: bool = False) -> Console:

@@ -1,6 +1,5 @@
 """``mavbridge replay``: read a flight, compute it again, report the differences."""
 
-import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -21,13 +20,13 @@ from mavbridge.commands.output import (
     print_status,
     require_outputs,
     table_console,
+    write_json,
 )
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.settings_files import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
-from mavbridge.core.files import write_output
 from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.action_frames import action_frame
@@ -115,8 +114,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         ),
     )
     print_replay(result, table_console())
-    if config.json is not None:
-        write_output(config.json, to_json(result), "--json")
+    write_json(config.json, _finite(as_document(result)))
     if config.plot is not None:
         draw(result, config.plot)
     return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
@@ -334,9 +332,9 @@ def _row(name: str, equal: str, deviation: Deviation) -> list[str]:
     return [name, equal, *("0" if each == 0 else f"{each:.2g}" for each in deviation.largest)]
 
 
-def to_json(result: ReplayResult) -> str:
-    """Return all figures as JSON."""
-    document = {
+def as_document(result: ReplayResult) -> dict[str, object]:
+    """Return all figures for ``--json``."""
+    return {
         "flight": str(result.source.folder),
         "from": result.chosen,
         "recorded_engine": result.source.meta.engine,
@@ -349,7 +347,6 @@ def to_json(result: ReplayResult) -> str:
         "guard": asdict(result.guard),
         "sticks": asdict(result.sticks.deviation),
     }
-    return json.dumps(_finite(document), indent=2) + "\n"
 
 
 def _finite(value: object) -> object:

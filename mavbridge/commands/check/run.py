@@ -1,6 +1,5 @@
 """``mavbridge check``: all rows, the table and the JSON."""
 
-import json
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -16,11 +15,11 @@ from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_
 from mavbridge.commands.check.soak import soak
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
-from mavbridge.commands.output import print_status, text_console
+from mavbridge.commands.output import as_json, print_status, text_console, write_json
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
-from mavbridge.core.files import empty_folders_removed, require_writable, write_output
+from mavbridge.core.files import empty_folders_removed, require_writable
 from mavbridge.flight.checks import file_checks, output_folders
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import looks_at_images, require_images
@@ -59,12 +58,12 @@ def check(config: CheckConfig) -> int:
         except MavbridgeError as error:
             row = CheckRow("computer", "soak", "not flown", no_go=str(error))
         rows.append(row)
-    document = json.dumps(as_document(rows) | {"soak": soaked}, indent=2) + "\n"
-    if config.json is not None and not is_on_stdout:
-        write_output(config.json, document, "--json")
+    document = as_document(rows) | {"soak": soaked}
+    if not is_on_stdout:
+        write_json(config.json, document)
     print_check(rows, text_console(stderr=is_on_stdout))
     if is_on_stdout:
-        sys.stdout.write(document)
+        sys.stdout.write(as_json(document))
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
 
 

@@ -1,7 +1,6 @@
 """``mavbridge inspect``: flights on the terminal, one in full or two side by side, and in files."""
 
 import heapq
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
@@ -17,10 +16,10 @@ from rich.text import Text
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse, recorded_solves
 from mavbridge.commands.inspect.page import write_page
-from mavbridge.commands.output import number, print_status, table_console
+from mavbridge.commands.output import number, print_status, table_console, write_json
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.files import require_writable, write_output
+from mavbridge.core.files import require_writable
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
@@ -248,8 +247,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
         print_flight(analyses[0], console)
     else:
         print_comparison(analyses, console)
-    if config.json is not None:
-        write_output(config.json, to_json(analyses), "--json")
+    write_json(config.json, [as_document(flight) for flight in analyses])
     if config.html is not None:
         write_page(config.html, analyses)
         print_status(f"wrote {config.html}")
@@ -258,28 +256,24 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
     return 0
 
 
-def to_json(analyses: Sequence[FlightAnalysis]) -> str:
-    """Return the figures, one object per flight; null: not measured."""
-    documents = [
-        {
-            "folder": str(flight.folder),
-            "damage": flight.damage,
-            "stick_hz": flight.stick_hz,
-            "report": report_document(flight.report),
-            "image_latency_ms": {
-                images.camera: images.latency_ms and asdict(images.latency_ms)
-                for images in flight.cameras
-            },
-            "causes": dict(flight.causes),
-            "holders": [
-                asdict(span) | {"reason": span.reason and reason_to_json(span.reason)}
-                for span in flight.holders
-            ],
-            "moments": [asdict(moment) for moment in flight.moments],
-        }
-        for flight in analyses
-    ]
-    return json.dumps(documents, indent=2, allow_nan=False) + "\n"
+def as_document(flight: FlightAnalysis) -> dict[str, object]:
+    """Return the figures of a flight for ``--json``; null: not measured."""
+    return {
+        "folder": str(flight.folder),
+        "damage": flight.damage,
+        "stick_hz": flight.stick_hz,
+        "report": report_document(flight.report),
+        "image_latency_ms": {
+            images.camera: images.latency_ms and asdict(images.latency_ms)
+            for images in flight.cameras
+        },
+        "causes": dict(flight.causes),
+        "holders": [
+            asdict(span) | {"reason": span.reason and reason_to_json(span.reason)}
+            for span in flight.holders
+        ],
+        "moments": [asdict(moment) for moment in flight.moments],
+    }
 
 
 def show_in_viewer(flight: FlightAnalysis, target: str) -> None:

@@ -1,6 +1,5 @@
 """Recorded doublets of vehicles whose response is known."""
 
-import json
 import math
 from collections.abc import Callable
 from io import StringIO
@@ -16,11 +15,11 @@ from mavbridge.commands.identify import (
     CHANNELS,
     Identification,
     ResponseRecording,
+    as_document,
     doublet_flight,
     doublet_policy,
     identify_pushes,
     print_identification,
-    to_json,
 )
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
@@ -149,7 +148,7 @@ def test_what_could_not_be_measured_is_told_beside_every_figure() -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "not measured: climb at 100%" in text
     assert "+8.1" in text
-    document = json.loads(to_json(found, Contract(), IdentifyConfig()))
+    document = as_document(found, Contract(), IdentifyConfig())
     assert [push["axis"] for push in document["pushes"]] == ["roll", "roll", "pitch", "pitch"]
     first = document["pushes"][0]
     assert first["measured"][0] == pytest.approx(8.1, abs=0.2)
