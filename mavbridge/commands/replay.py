@@ -267,14 +267,15 @@ class ReplayResult:
             found.append(f"the guard came out differently, first in the {self.guard.first}")
         if self.tolerance is None:
             return tuple(found)
-        for name, count in self.policy.missing.items() if self.policy else ():
-            found.append(f"{count} solves were not repeated: {name}")
-        for name, count in self.policy.inputs_differ.items() if self.policy else ():
-            if name not in PAST_INPUTS:
-                found.append(f"{count} solves were given another input: {name}")
-        other = 0 if self.policy is None else self.policy.solves - self.policy.equal_chunks
-        if other and self.policy is not None and self.tolerance == 0:
-            found.append(f"{other} of {self.policy.solves} chunks differ")
+        if (policy := self.policy) is not None:
+            for name, count in policy.missing.items():
+                found.append(f"{count} solves were not repeated: {name}")
+            for name, count in policy.inputs_differ.items():
+                if name not in PAST_INPUTS:
+                    found.append(f"{count} solves were given another input: {name}")
+            other = policy.solves - policy.equal_chunks
+            if other and self.tolerance == 0:
+                found.append(f"{other} of {policy.solves} chunks differ")
         if self.sticks.deviation.most > self.tolerance:
             found.append(
                 f"a stick is off by {self.sticks.deviation.most:.4g}, more than {self.tolerance:g}"

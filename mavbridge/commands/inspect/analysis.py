@@ -1,5 +1,6 @@
 """Analysis of a recorded flight: figures, who held the sticks, and the worst moments."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
@@ -79,19 +80,19 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
     ends_ns = [tick.woke_ns for tick in ticks[1:]] + [tick.woke_ns for tick in ticks[-1:]]
     for holder, group in groupby(zip(ticks, ends_ns, strict=True), lambda pair: _holder(pair[0])):
         span = list(group)
-        lasted_ns: dict[object, int] = {}
+        lasted_ns: Counter[object] = Counter()
         reasons: dict[object, Reason | None] = {}
         for tick, end_ns in span:
             reason = None if tick.trace is not None else tick.release_reason
             key = None if reason is None else reason.key
-            lasted_ns[key] = lasted_ns.get(key, 0) + end_ns - tick.woke_ns
+            lasted_ns[key] += end_ns - tick.woke_ns
             reasons[key] = reason
         spans.append(
             HolderSpan(
                 start_s=(span[0][0].woke_ns - start_ns) / NS_PER_S,
                 end_s=(span[-1][1] - start_ns) / NS_PER_S,
                 holder=holder,
-                reason=reasons[max(lasted_ns, key=lasted_ns.__getitem__)],
+                reason=reasons[lasted_ns.most_common(1)[0][0]],
             )
         )
     return tuple(spans)
@@ -159,11 +160,11 @@ class FlightAnalysis:
     @property
     def causes(self) -> tuple[tuple[str, int], ...]:
         """Number of late chunks and missed slots by cause, the most frequent first."""
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
         for delay in self.delays:
             if delay.cause is not None:
-                counts[delay.cause] = counts.get(delay.cause, 0) + delay.count
-        return tuple(sorted(counts.items(), key=lambda item: -item[1]))
+                counts[delay.cause] += delay.count
+        return tuple(counts.most_common())
 
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
