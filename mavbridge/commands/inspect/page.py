@@ -181,9 +181,11 @@ def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
     images = flight.images
     if not len(images.exposed_s):
         return None
-    size = images.video.stat().st_size
+    name, size, contract = images.video.name, images.video.stat().st_size, flight.meta.contract
+    if contract is not None and contract.is_depth:
+        return {"note": f"{name} holds depth, which browsers do not play: see it by --rerun"}
     if size > MAX_VIDEO_BYTES:
-        told = f"{images.video.name} has {size / 1e6:.0f} MB, too much for a page"
+        told = f"{name} has {size / 1e6:.0f} MB, too much for a page"
         return {"note": f"{told}: open it beside it"}
     data = b64encode(images.video.read_bytes()).decode()
     return {

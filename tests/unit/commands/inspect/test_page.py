@@ -17,6 +17,7 @@ from mavbridge.commands.inspect.page import write_page
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Position
+from policy.contract import Contract
 
 NASTY = "</script><script>document.title = 'mine'</script><!--"
 CHROMIUM = next(
@@ -75,6 +76,16 @@ def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
     assert shown["facts"][0][1].startswith(NASTY)
     assert shown["moments"][0]["detail"].startswith(NASTY)
     assert [span["reason"] for span in shown["holders"]] == ["", NASTY]
+
+
+def test_a_video_that_browsers_do_not_play_is_not_put_into_the_page(tmp_path: Path) -> None:
+    frames = [make_frame(k, rgb=np.full((48, 64), k, np.uint16)) for k in range(5)]
+    meta = make_meta(contract=Contract(image_channels="depth"))
+    write_recording(tmp_path / "depth", [*frames, make_tick(0)], meta=meta)
+    write_page(tmp_path / "page.html", [analyse(tmp_path / "depth")])
+    (shown,) = data_of((tmp_path / "page.html").read_text())
+    assert list(shown["video"]) == ["note"]
+    assert "camera.mp4 holds depth" in shown["video"]["note"]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")
