@@ -22,8 +22,6 @@ USUAL_KEYS = ("state_dict", "model_state_dict")
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
     """Write a ``.safetensors`` file; replaces ``path`` atomically."""
-    if path.suffix != ".safetensors":
-        raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     try:
         with whole_file(path) as draft:
             save_file(dict(tensors), draft, metadata=dict(header))

@@ -108,8 +108,6 @@ class FlightData:
 
 def common_frame(flights: Sequence[FlightData]) -> StateFrame:
     """Return the state frame that all flights share."""
-    if not flights:
-        raise DatasetError("no flights to learn from: name at least one flight folder")
     first = flights[0]
     for flight in flights:
         if flight.state_frame != first.state_frame:

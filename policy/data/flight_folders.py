@@ -40,8 +40,6 @@ _FRAME_COLUMNS = ("captured_ns",)
 def find_flights(paths: Sequence[Path]) -> list[Path]:
     """Return the paths that are flights, and the flights inside the paths that are folders of
     flights."""
-    if not paths:
-        raise DatasetError("no flights to learn from: name at least one flight folder")
     found: list[Path] = []
     for path in paths:
         if not path.is_dir():

@@ -126,8 +126,6 @@ def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.boo
 def _sent_until(flight: FlightData, at_ns: Nanoseconds) -> NDArray[np.float64]:
     """Integrate the sticks [N, 4] up to each time; a stick is held until the next one."""
     stamps, sticks = flight.sent_ns, flight.sent.astype(np.float64)
-    if len(stamps) == 0:
-        return np.zeros((len(at_ns), ACTION_DIM))
     held_s = np.diff(stamps)[:, None] / NS_PER_S
     before = np.concatenate([np.zeros((1, ACTION_DIM)), np.cumsum(sticks[:-1] * held_s, axis=0)])
     row = np.searchsorted(stamps, at_ns, side="right") - 1

@@ -68,9 +68,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
-        frame = network.contract.state_frame
-        stages = policy_stages(settings)
-        super().__init__(flights, trainee, stages, hooks, folder, state_frame=frame)
+        super().__init__(flights, trainee, policy_stages(settings), hooks, folder)
         self._flights = [flights[index] for index in self.kept]
         self._batches = self._batches_of(flights, self.kept)
         self._held = self._batches_of(flights, self.held) if self.held else None

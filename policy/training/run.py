@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.contract import StateFrame
-from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
+from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.errors import PolicyError
 from policy.training.batches import StepLoss, TensorBatch, ahead
@@ -84,12 +83,8 @@ class TrainingRun(ABC, Generic[M, B]):
         stages: Sequence[TrainingStage],
         hooks: Hooks,
         folder: Path,
-        *,
-        state_frame: StateFrame,
     ) -> None:
-        """Decode all images into ``folder``; the network takes states in ``state_frame``."""
-        if (frame := common_frame(flights)) != state_frame:
-            raise DatasetError(f"the flights hold {frame} states, the network takes {state_frame}")
+        """Decode all images into ``folder``."""
         settings = self.settings
         self.trainee, self.stages, self.hooks = trainee, stages, hooks
         self.device = torch.device(settings.device)

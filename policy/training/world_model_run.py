@@ -59,9 +59,8 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
     ) -> None:
         self.settings: WorldModelSettings = settings
         self._config = config
-        model, stages = _starting_model(config, settings), world_model_stages(settings)
-        frame = config.contract.state_frame
-        super().__init__(flights, model, stages, hooks, folder, state_frame=frame)
+        model = _starting_model(config, settings)
+        super().__init__(flights, model, world_model_stages(settings), hooks, folder)
         windows = find_windows(
             flights,
             context_frames=config.context_frames,

@@ -49,7 +49,7 @@ def test_a_file_alone_says_what_it_is_in_half_precision(model: WorldModel, tmp_p
 
 def test_another_file_is_refused(small_toge, model, tmp_path):
     path = tmp_path / "world.safetensors"
-    with pytest.raises(CheckpointError, match=r"stored as \.safetensors"):
+    with pytest.raises(CheckpointError, match=r"one of \.safetensors"):
         load_world_model(tmp_path / "world.pt")
     save_checkpoint(path, small_toge)
     with pytest.raises(CheckpointError, match="holds a policy"):
@@ -67,9 +67,8 @@ def test_what_cannot_be_written_is_told_and_leaves_the_file_before(model, tmp_pa
         sick.action_mean[1] = value
         with pytest.raises(CheckpointError, match="action_mean"):
             save_world_model(path, sick)
-    for name, says in (("missing/a.safetensors", "cannot write"), ("a.pt", "rename")):
-        with pytest.raises(CheckpointError, match=says):
-            save_world_model(tmp_path / name, model)
+    with pytest.raises(CheckpointError, match="cannot write"):
+        save_world_model(tmp_path / "missing" / "a.safetensors", model)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 

@@ -14,7 +14,7 @@ from helpers.flight_folders import write_spot_flight
 from helpers.training_runs import make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
@@ -222,14 +222,6 @@ def test_weights_that_diverge_are_refused(flights: list[FlightData], tmp_path: P
             lambda progress: notes.append(progress.note),
         )
     assert any(note is not None and "20 to 90 ms are assumed" in note for note in notes)
-
-
-def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
-    enu = replace(flights[0], state_frame="enu_flu")
-    with pytest.raises(DatasetError, match="one kind at a time"):
-        run([flights[0], enu], settings(tmp_path))
-    with pytest.raises(DatasetError, match="enu_flu states"):
-        run([enu], settings(tmp_path))
 
 
 @pytest.mark.parametrize(
