@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import Contract
-from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
+from policy.data.flight_data import DatasetError, FlightData, common_contract
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.runner import require_device
@@ -51,9 +51,10 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
     require_device(settings.device)
     config = WorldModelConfig(image_size=settings.image_size)
     flights = _read_flights(paths, settings)
-    if (action := common_terms(flights).action) != "sticks":
+    flown = common_contract(flights)
+    if (action := flown.action) != "sticks":
         raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
-    config = replace(config, contract=Contract(state_frame=common_frame(flights)))
+    config = replace(config, contract=Contract(state_frame=flown.state_frame))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
 
 
@@ -61,16 +62,16 @@ def fit_to_flights(
     network: BuiltinConfig, flights: Sequence[FlightData], settings: TrainSettings
 ) -> BuiltinConfig:
     """Return the network with the flights' frame and actions, and the settings' inputs."""
-    terms = common_terms(flights)
+    flown = common_contract(flights)
     contract = replace(
         network.contract,
-        state_frame=common_frame(flights),
+        state_frame=flown.state_frame,
         since_exposure=settings.since_exposure,
-        hover_thrust=terms.hover_thrust,
-        max_tilt_deg=terms.max_tilt_deg,
-        stops_at_end=terms.stops_at_end,
+        hover_thrust=flown.hover_thrust,
+        max_tilt_deg=flown.max_tilt_deg,
+        stops_at_end=flown.stops_at_end,
     )
-    if terms.action == "rates":
+    if flown.action == "rates":
         contract = rates_contract(contract)
     return replace(network, contract=contract)
 

@@ -4,13 +4,12 @@ All data keep their own timestamps, so the rates of camera, telemetry and sticks
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import QUATERNION, STATE_NAMES, ActionKind, FloatArray, StateFrame
+from policy.contract import QUATERNION, STATE_NAMES, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.preprocess import STATE_SCALE
 
@@ -29,25 +28,12 @@ class DatasetError(PolicyError):
     """Flights that cannot be learned from; the message names them and the reason."""
 
 
-class ActionTerms(NamedTuple):
-    """Kind and meaning of a flight's actions, by the fields of a contract."""
-
-    action: ActionKind = "sticks"
-    hover_thrust: float = 0.39
-    max_tilt_deg: float | None = None
-    stops_at_end: bool = False
-
-
-STICK_TERMS = ActionTerms()
-
-
 @dataclass(frozen=True, kw_only=True)
 class FlightData:
     """One flight; all stamps are of one monotonic clock and never decrease."""
 
     name: str
     """For messages, e.g. the folder."""
-    state_frame: StateFrame
     tick_ns: Nanoseconds
     """[T] decisions of the policy: image age and action history are relative to these."""
     state: FloatArray
@@ -71,7 +57,8 @@ class FlightData:
     """[N, 7], see ``GATE_DIM``."""
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
-    terms: ActionTerms = STICK_TERMS
+    contract: Contract
+    """Contract by which it was flown; of a foreign dataset, only the state's frame is known."""
     course_seed: int | None = None
     """Seed of the simulated course; its flights are held out together. None: unknown."""
     damage: tuple[str, ...] = ()
@@ -106,35 +93,31 @@ class FlightData:
             raise DatasetError(f"{self.name}: the attitude is not a unit quaternion")
 
 
-def common_frame(flights: Sequence[FlightData]) -> StateFrame:
-    """Return the state frame that all flights share."""
-    first = flights[0]
-    for flight in flights:
-        if flight.state_frame != first.state_frame:
-            raise DatasetError(
-                f"{first.name} holds its state in {first.state_frame}, {flight.name} in "
-                f"{flight.state_frame}: train on one kind at a time"
-            )
-    return first.state_frame
+def common_contract(flights: Sequence[FlightData]) -> Contract:
+    """Return the contract of flights of one state frame, action and hover thrust.
 
-
-def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
-    """Return the action terms that all flights share, with the largest of their tilts.
-
-    They stop at the end if all flights do.
+    It has the largest of their tilts, and stops at the end if all flights do.
     """
-    first = flights[0]
+    first, name = flights[0].contract, flights[0].name
     for flight in flights:
-        if flight.terms[:2] != first.terms[:2]:
+        contract = flight.contract
+        if contract.state_frame != first.state_frame:
             raise DatasetError(
-                f"{first.name} was flown by {first.terms.action} and hovers at a thrust of "
-                f"{first.terms.hover_thrust:g}, {flight.name} by {flight.terms.action} at "
-                f"{flight.terms.hover_thrust:g}: train on one kind at a time"
+                f"{name} holds its state in {first.state_frame}, {flight.name} in "
+                f"{contract.state_frame}: train on one kind at a time"
             )
-    tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
-    return first.terms._replace(
+        if (contract.action, contract.hover_thrust) != (first.action, first.hover_thrust):
+            raise DatasetError(
+                f"{name} was flown by {first.action} and hovers at a thrust of "
+                f"{first.hover_thrust:g}, {flight.name} by {contract.action} at "
+                f"{contract.hover_thrust:g}: train on one kind at a time"
+            )
+    contracts = [flight.contract for flight in flights]
+    tilts_deg = [each.max_tilt_deg for each in contracts if each.max_tilt_deg is not None]
+    return replace(
+        first,
         max_tilt_deg=max(tilts_deg, default=None),
-        stops_at_end=all(flight.terms.stops_at_end for flight in flights),
+        stops_at_end=all(each.stops_at_end for each in contracts),
     )
 
 

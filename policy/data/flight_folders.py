@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
 from policy.data.flight_data import (
     GATE_DIM,
-    ActionTerms,
     DatasetError,
     FlightData,
     ImageArray,
@@ -141,7 +140,6 @@ def read_flight(folder: Path) -> FlightData:
     state[~is_target] = np.nan
     return FlightData(
         name=name,
-        state_frame=contract.state_frame,
         tick_ns=tick_ns,
         state=state,
         attitude_ns=_stamps_or(name, ticks, "attitude_ns", tick_ns, _known(state)),
@@ -150,9 +148,7 @@ def read_flight(folder: Path) -> FlightData:
         target=target[is_target],
         sent_ns=sent_ns,
         sent=np.nan_to_num(sent, nan=0.0),
-        terms=ActionTerms(
-            contract.action, contract.hover_thrust, contract.max_tilt_deg, contract.stops_at_end
-        ),
+        contract=contract,
         course_seed=course_seed if isinstance(course_seed, int) else None,
         age_ns=_ages(name, ticks),
         captured_ns=stamps(name, frames, "captured_ns"),

@@ -21,6 +21,7 @@ from policy.contract import (
     NS_PER_S,
     SPECIFIC_FORCE,
     STATE_NAMES,
+    Contract,
     FloatArray,
     StateFrame,
 )
@@ -244,7 +245,7 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
     action = whole(names.ACTION_KEY, len(ACTION_NAMES))
     return FlightData(
         name=row.name,
-        state_frame=_state_frame(info, row, state),
+        contract=Contract(state_frame=_state_frame(info, row, state)),
         tick_ns=at(names.TICK),
         state=state,
         attitude_ns=at(names.ATTITUDE),

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from helpers.factories import about_z
 from helpers.flight_folders import spot
-from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY
+from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
 from policy.data.flight_data import FlightData
 
 MS = 1_000_000
@@ -47,7 +47,7 @@ def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Flight
 
     return FlightData(
         name=f"steered {seed}",
-        state_frame="ned_frd",
+        contract=Contract(),
         tick_ns=tick_ns,
         state=state,
         attitude_ns=tick_ns,

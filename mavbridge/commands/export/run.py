@@ -31,8 +31,7 @@ from policy.data.flight_data import (
     DatasetError,
     FlightData,
     Nanoseconds,
-    common_frame,
-    common_terms,
+    common_contract,
 )
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.interpolation import MAX_GAP_NS
@@ -177,8 +176,9 @@ def write_dataset(
     Raises:
         UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
     """
-    if (action := common_terms(list(episodes)).action) != "sticks":
-        raise UserError(f"these flights were flown by {action}: this command exports sticks")
+    flown = common_contract(list(episodes))
+    if flown.action != "sticks":
+        raise UserError(f"these flights were flown by {flown.action}: this command exports sticks")
     parts = [stretches(episode) for episode in episodes]
     every = list(chain.from_iterable(parts))
     if not every:
@@ -195,7 +195,7 @@ def write_dataset(
         fps=fps,
         height=height,
         width=width,
-        state_frame=common_frame(list(episodes)),
+        state_frame=flown.state_frame,
         task=config.task,
         state_names=BODY_STATE_NAMES if config.state == "body" else STATE_NAMES,
     )

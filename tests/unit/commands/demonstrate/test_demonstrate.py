@@ -19,7 +19,6 @@ from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.meta import write_meta
 from mavbridge.simulation.referee import EpisodeInterruptedError
-from policy.data.flight_data import ActionTerms
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED, SHIPPED_RATES
 from policy.nets.toge import TogeConfig
@@ -195,7 +194,7 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     assert first is None or isinstance(first, BodyRates)  # the chunk may be from before
     assert {type(word) for word in words} == {BodyRates}
     data = read_flight(flight.folder)
-    assert data.terms == ActionTerms("rates", 0.39, 80.0, stops_at_end=True)
+    assert (data.contract.action, data.contract.hover_thrust) == ("rates", 0.39)
     assert 0.1 < np.abs(data.target).max() <= 1.0
     assert not data.sent.any()
     network = fit_to_flights(TogeConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))

@@ -101,7 +101,7 @@ def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
 def test_a_round_trip_keeps_rows_and_images(flights: list[Path], dataset: Path) -> None:
     for folder, back in zip(flights, read_dataset(dataset), strict=True):
         flight = read_flight(folder)
-        assert back.state_frame == flight.state_frame
+        assert back.contract.state_frame == flight.contract.state_frame
         np.testing.assert_array_equal(back.captured_ns, flight.captured_ns)
         (part,) = stretches(flight)  # whose rows the tests of rows compare with the flight
         for name, values in {

@@ -12,6 +12,7 @@ from mavbridge.commands.export.run import (
     stretches,
     worst_shift_ns,
 )
+from policy.contract import Contract
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, FlightData
 
@@ -32,7 +33,7 @@ def episode(
     state[[k for k in unknown if k < len(ticks)]] = np.nan
     return FlightData(
         name="a flight",
-        state_frame="ned_frd",
+        contract=Contract(),
         tick_ns=ticks,
         state=state,
         attitude_ns=ticks - lag_ms * MS,

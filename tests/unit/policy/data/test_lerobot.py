@@ -109,8 +109,10 @@ def test_a_foreign_dataset_has_its_timestamps_for_everything(kind: str, tmp_path
 
 def test_the_frame_of_the_state_is_where_gravity_says(tmp_path: Path) -> None:
     flu = (*LEVEL[:-1], 9.8)
-    assert read_dataset(write(tmp_path / "a"))[0].state_frame == "ned_frd"
-    assert read_dataset(write(tmp_path / "b", state=flu), CAMERA)[0].state_frame == "enu_flu"
+    assert read_dataset(write(tmp_path / "a"))[0].contract.state_frame == "ned_frd"
+    assert (
+        read_dataset(write(tmp_path / "b", state=flu), CAMERA)[0].contract.state_frame == "enu_flu"
+    )
     with pytest.raises(DatasetError, match="no camera tail"):
         read_dataset(tmp_path / "a", "tail")
 

@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from mavbridge.flight.state import motion_since
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
-from policy.data.flight_data import ActionTerms, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.samples import (
     BLIND_SHARE,
     FORCE_NOISE_MPS2,
@@ -169,10 +169,9 @@ def test_a_mirrored_flight_is_seen_mirrored_from_the_vehicle() -> None:
 def test_rates_and_forces_are_noisy_in_training_by_rates_alone() -> None:
     """Rates and forces, nothing else of the state, and only for rates."""
     by_rates = Contract(since_exposure=True, horizon=4, action="rates")
-    terms = ActionTerms("rates")
     ticks, frames = np.full(400, 60), np.full(400, 15)
     for contract, flight, is_hidden in (
-        (by_rates, flown(terms=terms), True),
+        (by_rates, flown(contract=by_rates), True),
         (CONTRACT, flown(), False),
     ):
         timeline = Timeline([flight], contract, np.array([40 * MS]))
