@@ -182,12 +182,9 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS)
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
-    def step(self, _now_ns: int) -> None:
-        now_ns = self._ap.now_ns
-        self._send_next_param(now_ns)
-        for message_id in self._due(now_ns):
-            self.send_now(message_id)
-        if now_ns >= self._timesync_due_ns:
+    def step(self, now_ns: int) -> None:
+        super().step(now_ns)
+        if self._ap.now_ns >= self._timesync_due_ns:
             self._timesync_due_ns += TIMESYNC_PERIOD_NS
             uptime_ns = self._ap.uptime_ns
             self.send(mav.MAVLink_timesync_message(0, uptime_ns + self._ap.system_id))
@@ -231,8 +228,9 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         """Shortest interval, 1 / (0.8 * loop rate) in whole milliseconds: 3 ms at 400 Hz."""
         return int(1000.0 / (0.8 * max(50.0, self._ap.params["SCHED_LOOP_RATE"])))
 
-    def _due(self, now_ns: int) -> list[int]:
+    def _due(self) -> list[int]:
         """Return the ids of the messages to send now; after missed slots, each is sent once."""
+        now_ns = self._ap.now_ns
         ready = [
             key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
         ]

@@ -47,9 +47,17 @@ class Endpoint(ABC, Generic[Ap]):
         self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
 
-    @abstractmethod
     def step(self, now_ns: int) -> None:
         """Queue due messages; ``now_ns`` is at most one control step ahead of the vehicle."""
+        if self._queued_params and now_ns >= self._param_due_ns:
+            self._param_due_ns = now_ns + PARAM_PERIOD_NS
+            self.send_param(self._queued_params.popleft())
+        for message_id in self._due():
+            self.send_now(message_id)
+
+    @abstractmethod
+    def _due(self) -> list[int]:
+        """Return the ids of the streamed messages to send now."""
 
     @abstractmethod
     def set_interval(self, message_id: int, interval_us: int) -> bool:
@@ -111,12 +119,6 @@ class Endpoint(ABC, Generic[Ap]):
         value = (params.on_wire(name), params.kind(name))
         count = len(params.names)
         self.send(mav.MAVLink_param_value_message(name.encode(), *value, count, index))
-
-    def _send_next_param(self, now_ns: int) -> None:
-        """Send the next parameter of the list if it is due."""
-        if self._queued_params and now_ns >= self._param_due_ns:
-            self._param_due_ns = now_ns + PARAM_PERIOD_NS
-            self.send_param(self._queued_params.popleft())
 
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED

@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_MS
 from sitl.link.server import Endpoint, by_message
 from sitl.link.telemetry import Fields, Message, Telemetry
 from sitl.px4.autopilot import Px4
@@ -199,6 +199,7 @@ def _at_rate(ap: Px4, period_ms: int) -> int:
 
 
 NS_PER_US = 1000
+HEARTBEAT_US = 1_000_000
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL has an int32
 
 _BOTH = {CURRENT_MODE: 0.5, mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0}
@@ -235,23 +236,11 @@ class Px4Endpoint(Endpoint[Px4]):
         self._event_sequence = 0
         super().__init__(ap, Px4Telemetry(ap))
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
-        self._streams: dict[int, _Stream] = {}
+        before_us = ap.now_ns // NS_PER_US - HEARTBEAT_US  # the first one is sent at once
+        heartbeat = _Stream(interval_us=HEARTBEAT_US, sent_us=before_us)
+        self._streams = {mav.MAVLINK_MSG_ID_HEARTBEAT: heartbeat}
         for message_id, interval_us in self._default_us.items():
             self._start(message_id, interval_us)
-        self._heartbeat_due_ns = ap.now_ns
-        self._looked_ns = ap.now_ns
-
-    def step(self, now_ns: int) -> None:
-        """Queue due messages: streams once per control step, parameters at every call."""
-        ap = self._ap
-        self._send_next_param(now_ns)
-        if ap.now_ns >= self._heartbeat_due_ns:
-            self._heartbeat_due_ns += NS_PER_S
-            self.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
-        if ap.now_ns != self._looked_ns:
-            self._looked_ns = ap.now_ns
-            for message_id in self._due():
-                self.send_now(message_id)
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the link's default."""
