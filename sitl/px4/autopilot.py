@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from sitl.clock import NS_PER_S
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD, STEP_NS
-from sitl.px4.flight import Px4Control, Setpoint
+from sitl.px4.flight import Px4Control
 from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, Px4Sticks
@@ -38,20 +38,11 @@ class Px4(Commander):
         super().__init__(params, config, boot_ns)
         self.receiver_us = config.receiver_us
         """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
-        self.setpoint: Setpoint | None = None
-        self.setpoint_count = 0
         self.flight = Px4Control(params)
-        self._setpoint_ns = boot_ns
         self._has_transmitter = config.receiver_us is not None
         self._receiver_due_ns = boot_ns
         self._ramp_ns: int | None = None  # start of the takeoff ramp; None: no ramp
         self._flown_mode = self.mode
-
-    @property
-    def setpoint_fresh(self) -> bool:
-        """True until the newest setpoint is COM_OF_LOSS_T old."""
-        age_ns = self.now_ns - self._setpoint_ns
-        return self.setpoint is not None and age_ns < self.params["COM_OF_LOSS_T"] * NS_PER_S
 
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
@@ -68,11 +59,6 @@ class Px4(Commander):
         self._has_transmitter = any(values_us)
         if self._has_transmitter:
             self.receiver_us = tuple(values_us)
-
-    def set_setpoint(self, setpoint: Setpoint, now_ns: int) -> None:
-        """Take a setpoint, which only OFFBOARD uses."""
-        self.setpoint, self._setpoint_ns = setpoint, now_ns
-        self.setpoint_count += 1
 
     def prepare_takeoff(self, height_m: float | None) -> None:
         above_m = self.params["MIS_TAKEOFF_ALT"] - self.sensed.position_ned_m[2]

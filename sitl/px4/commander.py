@@ -4,10 +4,10 @@ The intended mode is the last one that the pilot or a command requested. The flo
 a failsafe may change it and leaves the intended one alone.
 """
 
-from abc import abstractmethod
 from typing import Literal, NamedTuple
 
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.px4.flight import Setpoint
 from sitl.px4.modes import LostSticks, Phase, Px4Mode, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
@@ -58,17 +58,15 @@ class Commander(Autopilot):
         self.stick_input = StickInput(params)
         self.lost_sticks = LostSticks(params)
         self.events: list[Event] = []  # events to send; the reader empties the list
+        self.setpoint: Setpoint | None = None
+        self.setpoint_count = 0
+        self._setpoint_ns = boot_ns
         self._fallback = False
         self._sticks_missed = True  # the loss of sticks has been noticed
         self._was_lost = False
         self._ignores_sticks = False  # no failsafe: sticks were absent at arming
         self._armed_ns = self._landed_ns = self._check_due_ns = boot_ns
         self._has_flown = False
-
-    @property
-    @abstractmethod
-    def setpoint_fresh(self) -> bool:
-        """True while setpoints for OFFBOARD arrive."""
 
     @property
     def mode_name(self) -> str:
@@ -78,13 +76,26 @@ class Commander(Autopilot):
     def in_failsafe(self) -> bool:
         return self.armed and (self.lost_sticks.active or self._fallback)
 
+    def set_setpoint(self, setpoint: Setpoint, now_ns: int) -> None:
+        """Take a setpoint, which only OFFBOARD uses."""
+        self.setpoint, self._setpoint_ns = setpoint, now_ns
+        self.setpoint_count += 1
+
     def can_fly(self, mode: Px4Mode) -> bool:
         """True if the mode has the sticks, position or stream of setpoints that it needs."""
         if mode.piloted and not self.stick_input.valid:
             return False
         if mode.needs_position and not self.position_ready:
             return False
-        return self.setpoint_fresh if mode is Px4Mode.OFFBOARD else mode is not Px4Mode.AUTO_MISSION
+        if mode is Px4Mode.OFFBOARD:
+            return self._has_stream
+        return mode is not Px4Mode.AUTO_MISSION
+
+    @property
+    def _has_stream(self) -> bool:
+        """True until the newest setpoint is COM_OF_LOSS_T old."""
+        age_ns = self.now_ns - self._setpoint_ns
+        return self.setpoint is not None and age_ns < self.params["COM_OF_LOSS_T"] * NS_PER_S
 
     def can_arm(self) -> bool:
         """True if the vehicle's health allows arming; sticks may still be too high."""
@@ -239,7 +250,7 @@ class Commander(Autopilot):
             self.mode = self._with_position(self.lost_sticks.mode())
             return
         wanted = self.intended
-        if wanted is Px4Mode.OFFBOARD and not self.setpoint_fresh:
+        if wanted is Px4Mode.OFFBOARD and not self._has_stream:
             wanted = mode_without_stream(self.params, has_sticks=self.stick_input.valid)
         wanted = self._with_position(wanted)
         was_fallback, self._fallback = self._fallback, wanted is not self.intended
