@@ -308,29 +308,16 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
 
 
 def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
+    """Yield the images of a table, PNG or JPEG; LeRobot's cells are ``{"bytes", "path"}``."""
     table = _read_table(row.data, ["episode_index", info.camera])
-    for number, value in enumerate(_rows_of(table, row)[info.camera].to_pylist()):
-        encoded, name = _encoded_image(info.folder, value)
-        image = f"{row.name}: the image of row {number}{name and f' ({name})'}"
-        if not encoded:
-            raise DatasetError(f"{image} is empty, and no file lies at its path: copy it again")
-        bgr = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    for number, cell in enumerate(_rows_of(table, row)[info.camera].to_pylist()):
+        encoded = cell.get("bytes") if isinstance(cell, dict) else cell
+        bgr = None
+        if isinstance(encoded, bytes) and encoded:
+            bgr = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:
-            raise DatasetError(f"{image} is not a PNG or JPEG that can be decoded")
+            raise DatasetError(
+                f"{row.name}: the image of row {number} is not a PNG or JPEG in the table that can "
+                "be decoded: copy the dataset again, or save it again with LeRobot"
+            )
         yield cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-
-
-def _encoded_image(folder: Path, value: object) -> tuple[bytes, str]:
-    """Return an image cell's bytes and path; if the cell has no bytes, those of its file.
-
-    LeRobot's cells are ``{"bytes", "path"}``; until images are embedded, only the path is set. A
-    path that leads out of the dataset's folder is not followed.
-    """
-    cell = value if isinstance(value, dict) else {"bytes": value}
-    encoded, name = cell.get("bytes"), str(cell.get("path") or "")
-    if encoded or not name:
-        return encoded if isinstance(encoded, bytes) else b"", name
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder.resolve()) or not path.is_file():
-        return b"", name
-    return path.read_bytes(), name
