@@ -178,14 +178,11 @@ def read_json(path: Path) -> Any:
 def read_object(path: Path, error: type[PolicyError], kind: str) -> dict[str, Any]:
     """Read a JSON object in a folder of this ``kind``; raise ``error`` if there is none."""
     try:
-        data = read_json(path)
+        return parse_object(read_text(path), error, str(path))
     except OSError as failure:
         raise error(f"{path}: {failure.strerror}: is it a {kind}?") from failure
     except ValueError as failure:
         raise error(f"{path} is not JSON: {failure}") from failure
-    if not isinstance(data, dict):
-        raise error(f"{path} is not a JSON object: is it a {kind}?")
-    return data
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -25,10 +25,11 @@ from policy.contract import (
 from policy.data.lerobot_format import (
     ACTION_KEY,
     INFO,
-    STATE_FRAME,
     STATE_KEY,
     STATS,
     feature_names,
+    frame_by_gravity,
+    noted_frame,
 )
 from policy.errors import CheckpointError
 
@@ -175,19 +176,16 @@ def _lerobot_entries(
 
 
 def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | None) -> Entry:
-    """Return the frame that mavbridge's export recorded; else tell it by gravity: in level flight
-    -z is up in FRD, +z in FLU."""
-    about = features.get(STATE_KEY, {}).get("info")
-    if isinstance(about, dict) and STATE_FRAME in about:
-        return Entry("contract", "state_frame", str(about[STATE_FRAME]), f"the dataset's {INFO}")
+    """Return the frame that mavbridge's export noted; else tell it by gravity."""
+    if (noted := noted_frame(features.get(STATE_KEY, {}))) is not None:
+        return Entry("contract", "state_frame", str(noted), f"the dataset's {INFO}")
     try:
         stats = files.read_json(dataset / STATS)
         mean = float(stats[STATE_KEY]["mean"][list(names or ()).index("az_mps2")])
     except (OSError, ValueError, KeyError, IndexError, TypeError):
         return _ASKED_FRAME
     why = f"the mean of az_mps2 is {mean:.1f}, by {STATS}"
-    frame = "ned_frd" if mean < 0 else "enu_flu"
-    return Entry("contract", "state_frame", frame, why, "guessed")
+    return Entry("contract", "state_frame", frame_by_gravity(mean), why, "guessed")
 
 
 def _width(feature: object) -> int:

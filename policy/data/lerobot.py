@@ -262,16 +262,15 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
 
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
-    """Return the frame in ``info``, else by gravity: in level flight -z is up in FRD, +z in FLU."""
-    about = info.features[names.STATE_KEY].get("info")
-    noted = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
+    """Return the noted frame, else tell it by gravity."""
+    noted = names.noted_frame(info.features[names.STATE_KEY])
     if noted in get_args(StateFrame):
         return cast(StateFrame, noted)
     if noted is not None:
         raise DatasetError(
             f"{row.name}: its state frame is {noted!r}; known are {list(get_args(StateFrame))}"
         )
-    return "ned_frd" if np.median(state[:, SPECIFIC_FORCE][:, 2]) < 0 else "enu_flu"
+    return names.frame_by_gravity(float(np.median(state[:, SPECIFIC_FORCE][:, 2])))
 
 
 def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:

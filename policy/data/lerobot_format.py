@@ -4,6 +4,10 @@ Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, info), ``datasets/dataset_w
 ``datasets/dataset_metadata.py`` (columns of the episodes), ``utils/constants.py`` (features).
 """
 
+from collections.abc import Mapping
+
+from policy.contract import StateFrame
+
 CODEBASE_VERSION = "v3.0"
 
 INFO = "meta/info.json"
@@ -41,3 +45,14 @@ def feature_names(feature: object) -> list[str] | None:
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
         names = next(iter(names.values()))
     return [str(name) for name in names] if isinstance(names, list) else None
+
+
+def noted_frame(feature: Mapping[str, object]) -> object:
+    """Return the state frame that mavbridge noted in the state's feature; None if it did not."""
+    about = feature.get("info")
+    return about.get(STATE_FRAME) if isinstance(about, dict) else None
+
+
+def frame_by_gravity(az_mps2: float) -> StateFrame:
+    """Tell the frame by the usual force along z: in level flight -z is up in FRD, +z in FLU."""
+    return "ned_frd" if az_mps2 < 0 else "enu_flu"
