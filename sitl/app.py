@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
+from typing import Any
 
 from sitl import UsageError
 from sitl.camera.follow import film_vehicle
@@ -161,7 +162,9 @@ def _parser() -> argparse.ArgumentParser:
         "shared memory over a course of gates.",
         allow_abbrev=False,
     )
-    parser.set_defaults(run=_fly)
+    parser.set_defaults(run=_fly, course=0, laps=1, image_size=224, fps=30.0)
+    # A default of a command would replace a flag that is given before the command.
+    keeps: dict[str, Any] = {"allow_abbrev": False, "argument_default": argparse.SUPPRESS}
     add = parser.add_argument
     connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
     add("--connect", action="append", metavar="LINK", help=connect_help)
@@ -188,15 +191,16 @@ def _parser() -> argparse.ArgumentParser:
     _add_camera_flags(parser)
     commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
     camera_help = "film the course from another vehicle's reported pose"
-    camera = commands.add_parser("camera", help=camera_help, allow_abbrev=False)
+    camera = commands.add_parser("camera", help=camera_help, **keeps)
     camera.set_defaults(run=_film)
     follow_help = "its MAVLink link: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to connect"
     camera.add_argument("--follow", required=True, metavar="LINK", help=follow_help)
     _add_camera_flags(camera)
-    course = commands.add_parser("course", help="print a course", allow_abbrev=False)
+    course = commands.add_parser("course", help="print a course", **keeps)
     course.set_defaults(run=_print_course)
     _add_course_flags(course)
-    course.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    json_help = "print JSON instead of a table"
+    course.add_argument("--json", action="store_true", default=False, help=json_help)
     return parser
 
 
@@ -205,15 +209,15 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
     add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
     _add_course_flags(parser)
     size_help = "side of the square image (default: 224)"
-    add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
-    add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
+    add("--image-size", type=_IMAGE_SIZE, metavar="PIXELS", help=size_help)
+    add("--fps", type=_POSITIVE, metavar="HZ", help="frame rate (default: 30)")
 
 
 def _add_course_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
+    add("--course", type=_SEED, metavar="SEED", help="seed of the gates (default: 0)")
     laps_help = f"laps of a loop, a course from seed {LOOP_SEEDS} on (default: 1)"
-    add("--laps", type=_LAPS, default=1, metavar="N", help=laps_help)
+    add("--laps", type=_LAPS, metavar="N", help=laps_help)
 
 
 def _fly(args: argparse.Namespace) -> None:

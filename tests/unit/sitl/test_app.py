@@ -109,6 +109,14 @@ def test_bad_flags_exit_with_two(argv, capsys):
     assert "error" in capsys.readouterr().err
 
 
+def test_a_flag_before_the_command_counts_as_one_after_it(capsys):
+    printed = []
+    for argv in (["--course", "7", "course"], ["course", "--course", "7"], ["course"]):
+        assert main(argv) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1] != printed[2]
+
+
 def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
