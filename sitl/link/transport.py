@@ -57,6 +57,8 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
         if kind.startswith("tcp"):
             return TcpLink(address, clock, listen=kind == "tcpin")
         return UdpLink(address, clock, listen=kind != "udpout")
+    except UnicodeError as error:
+        raise UsageError(f"link {url!r}: {host!r} is no host's name") from error
     except OSError as error:
         raise UsageError(f"link {url!r}: {_reason(error)}") from error
 

@@ -119,6 +119,7 @@ def accept_while_sending(server, link, data):
         "foo:127.0.0.1:1",
         "udpin:127.0.0.1",
         "udpin:127.0.0.1:x",
+        "udpout:host..lan:14550",
         "udpin::14550",
         "udpin:127.0.0.1:0",
         "udpin:127.0.0.1:65536",
