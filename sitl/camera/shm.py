@@ -38,7 +38,11 @@ class FramePublisher:
         size = math.prod(self._shape) * self._type.itemsize
         stride = -(-(SLOT_HEADER_BYTES + size) // 64) * 64
         header = struct.pack("<IIII", width, height, 1 if is_depth else CHANNELS, SLOTS)
-        self._map, self._inode = _create(self._path, header, HEADER_BYTES + SLOTS * stride)
+        try:
+            self._map, self._inode = _create(self._path, header, HEADER_BYTES + SLOTS * stride)
+        except OSError as error:
+            reason = f"{error.strerror}; give another name or make room in {self._path.parent}"
+            raise UsageError(f"shm:{name}: {reason}") from error
         self._header = np.frombuffer(self._map, np.int64, HEADER_BYTES // 8)
         starts = range(HEADER_BYTES, HEADER_BYTES + SLOTS * stride, stride)
         self._fields = [np.frombuffer(self._map, np.int64, 4, start) for start in starts]

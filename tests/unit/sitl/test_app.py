@@ -128,6 +128,7 @@ def test_bad_requests_exit_with_two_and_one_line(capsys, tmp_path):
             ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path / "no" / "fc.json")],
             ["--connect", "udpout:127.0.0.1:9", "--report", str(tmp_path), "--duration", "0.01"],
             ["--connect", "udpout:127.0.0.1:9", "--report", "/proc/fc.json", "--duration", "0.01"],
+            ["--connect", "udpout:127.0.0.1:9", "--camera", "shm:" + 300 * "x"],
             ["camera", "--follow", "udp:127.0.0.1:9"],
             ["--connect", "udpout:127.0.0.1:9", "--rc-in", url.rpartition(":")[2]],
         ]
