@@ -98,6 +98,16 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def find_weights(path: Path, loaded: Mapping[Any, Any]) -> dict[str, Tensor]:
     """Return the weights of a torch file: it is a state dict, or holds one under a usual key."""
+    tables = [
+        key
+        for key, table in loaded.items()
+        if isinstance(table, Mapping) and any(isinstance(each, Tensor) for each in table.values())
+    ]
+    if len(tables) > 1:
+        raise CheckpointError(
+            f"{path}: holds weights as {' and '.join(map(repr, tables))}: save those that are to "
+            "fly alone, as model.state_dict()"
+        )
     found = next((loaded[key] for key in USUAL_KEYS if key in loaded), loaded)
     if isinstance(found, Mapping):
         weights = {

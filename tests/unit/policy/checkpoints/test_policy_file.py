@@ -209,7 +209,8 @@ def test_state_dicts_load_bare_and_as_training_loops_save_them(small_toge, tmp_p
         (lambda s: {"state_dict": s, "contract": "{}"}, "holds a contract"),
         (lambda s: torch.optim.Adam([nn.Parameter(s[NAME])]).state_dict(), "no weights found"),
         (lambda s: {"shadow_params": list(s.values())}, "no weights found"),
-        (lambda s: {"model": s, "ema": s}, r"it holds \['ema', 'model'\].*save model.state_dict"),
+        (lambda s: {"model": s}, r"it holds \['model'\].*save model.state_dict"),
+        (lambda s: {"state_dict": s, "ema": s}, "weights as 'state_dict' and 'ema': .* alone"),
         (
             lambda s: {name: value for name, value in s.items() if name != NAME},
             r"missing 'fusion\.mlp\.0\.weight'",
