@@ -31,7 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from rich.markup import escape
 
         from mavbridge.cli import cli
+        from mavbridge.observe.output import survive_lost_readers
 
+        if arguments is None:
+            survive_lost_readers()
         status = cli.meta(arguments)
     except KeyboardInterrupt:
         end_process(128 + signal.SIGINT)

@@ -202,10 +202,10 @@ def evaluate(config: EvaluateConfig) -> int:
         except MavbridgeError as error:
             failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
-    if flown:
-        print_evaluation(config, flown, text_console())
     if flown or failure is None:
         write_json(config.json, as_document(config, flown, flown_by))
+    if flown:
+        print_evaluation(config, flown, text_console())
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(f"{ended}{config.episodes} episodes", style="yellow")

@@ -1,11 +1,13 @@
-"""Console output that a stalled reader cannot block."""
+"""Console output that a stalled reader cannot block and a lost one cannot fail."""
 
+import errno
 import io
 import os
 import select
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TextIO, cast
 
 from rich.console import Console
@@ -74,6 +76,38 @@ def flight_console() -> Console:
         return Console(file=cast(TextIO, PatientOutput(sys.stderr)), emoji=False)
     except (OSError, AttributeError):  # standard error is closed, or replaced by a mere buffer
         return Console(stderr=True, emoji=False)
+
+
+class _SurvivingText(io.TextIOWrapper):
+    """Text stream that goes to the null device once its reader or terminal is gone."""
+
+    def write(self, text: str, /) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._give_up(error)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        if error.errno not in (errno.EPIPE, errno.EIO):
+            raise error
+        with Path(os.devnull).open("wb") as null:
+            os.dup2(null.fileno(), self.fileno())
+
+
+def survive_lost_readers() -> None:
+    """Let standard output and error outlive their reader, so that a command finishes its files."""
+    for name in ("stdout", "stderr"):
+        if (old := getattr(sys, name)) is not None:
+            buffer = io.BufferedWriter(io.FileIO(old.fileno(), "wb", closefd=False))
+            new = _SurvivingText(buffer, old.encoding, old.errors, line_buffering=True)
+            setattr(sys, name, new)
 
 
 class _Lines(io.TextIOBase):
