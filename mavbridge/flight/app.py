@@ -109,23 +109,23 @@ def fly_policy(
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
     flight: _Flight | None = None
-    try:
-        with ExitStack() as stack:
-            guard = guard or start_guard(plan.config, clock, stack)
-            prepare_to_die_first()
-            flight = _Flight(plan, clock, console, runner, guard, sinks, stack)
-            # Only now: until a stick can have been taken, a signal may simply end the process.
-            stop = stack.enter_context(stop_on_signals())
-            guard.send(plan.guard)
-            flight.run(stop)
-        return flight.verdict(stop)
-    except MavbridgeError as error:
-        if flight is not None and flight.has_flown:
-            error.exit_code = ExitCode.FAULT
-        raise
-    finally:
-        if flight is not None:
-            with stop_on_signals():  # the flight has its status; what is left has deadlines
+    with ExitStack() as signals:  # handled until the recording and the report are written
+        try:
+            with ExitStack() as stack:
+                guard = guard or start_guard(plan.config, clock, stack)
+                prepare_to_die_first()
+                flight = _Flight(plan, clock, console, runner, guard, sinks, stack)
+                # Only now: until a stick can have been taken, a signal may simply end the process.
+                stop = signals.enter_context(stop_on_signals())
+                guard.send(plan.guard)
+                flight.run(stop)
+            return flight.verdict(stop)
+        except MavbridgeError as error:
+            if flight is not None and flight.has_flown:
+                error.exit_code = ExitCode.FAULT
+            raise
+        finally:
+            if flight is not None:
                 flight.finish()
 
 

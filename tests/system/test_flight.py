@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from faults.processes import Process
 from faults.relay import Override
 from faults.stage import faulty_policy, staged
 from helpers.flight_logs import logged_overrides
@@ -128,6 +129,24 @@ def test_readonly_runs_both_loops_or_one_after_a_warning_and_sends_nothing(tmp_p
     assert without_fast_path["action"]["target_hz"] == 30
     assert "single-rate" in output
     assert flying.relay.overrides == []
+
+
+def test_a_signal_while_the_recording_is_closed_loses_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "recording"
+    with staged(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
+        assert flying.relay.has_flown.wait(60)
+        guard, writer = flying.guard, Process(flying.pid_of("recorder"), flying.clock)
+        flying.observe(0.5)
+        writer.kill(signal.SIGSTOP)
+        flying.kill(signal.SIGTERM)
+        assert guard.has_ended(60)
+        flying.observe(0.5)
+        flying.kill(signal.SIGHUP)
+        writer.kill(signal.SIGCONT)
+        assert flying.end()[0] == 0
+    assert flying.report()["outcome"] is not None
+    assert open_flight(folder).meta.finished
 
 
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:

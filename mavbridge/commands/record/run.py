@@ -71,9 +71,9 @@ def record(config: RecordConfig) -> int:
     prepare_out(config.out)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
-    with ExitStack() as stack:
+    with ExitStack() as signals, ExitStack() as stack:  # signals: handled until all is closed
         session = _Session(config, clock, flight_console(), stack)
-        session.run(stack.enter_context(stop_on_signals()))
+        session.run(signals.enter_context(stop_on_signals()))
     return 0
 
 
