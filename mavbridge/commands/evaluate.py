@@ -201,9 +201,11 @@ def evaluate(config: EvaluateConfig) -> int:
                         write_json(config.json, as_document(config, flown, flown_by))
         except MavbridgeError as error:
             failure = error  # the episodes flown before that still count
+        except KeyboardInterrupt:  # the second request: the policy hangs
+            stop.set()
+        if flown or failure is None:
+            write_json(config.json, as_document(config, flown, flown_by))
         was_stopped = stop.is_set()
-    if flown or failure is None:
-        write_json(config.json, as_document(config, flown, flown_by))
     if flown:
         print_evaluation(config, flown, text_console())
     if failure is not None or was_stopped:

@@ -61,13 +61,23 @@ class StopRequest:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
-    """Context manager: SIGINT, SIGTERM and SIGHUP request the stop."""
+def stop_on_signals(*, is_bounded: bool = False) -> Iterator[StopRequest]:
+    """Context manager: SIGINT, SIGTERM and SIGHUP request the stop.
+
+    The second request raises KeyboardInterrupt and the third exits at once, because a policy may
+    hang, unless the block ``is_bounded``: it ends by deadlines of its own.
+    """
     stop = StopRequest()
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
         stop.signal_number = stop.signal_number or number
+        before = stop.requests
         stop.set()
+        if is_bounded or before == 0 or stop.requests == before:
+            return
+        if before > 1:
+            os._exit(128 + number)
+        raise KeyboardInterrupt
 
     # SIGHUP: the terminal, or the connection to this computer, is gone.
     names = ("SIGINT", "SIGTERM", "SIGHUP")

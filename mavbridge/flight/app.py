@@ -116,7 +116,7 @@ def fly_policy(
                 prepare_to_die_first()
                 flight = _Flight(plan, clock, console, runner, guard, sinks, stack)
                 # Only now: until a stick can have been taken, a signal may simply end the process.
-                stop = signals.enter_context(stop_on_signals())
+                stop = signals.enter_context(stop_on_signals(is_bounded=True))
                 guard.send(plan.guard)
                 flight.run(stop)
             return flight.verdict(stop)

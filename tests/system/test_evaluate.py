@@ -1,8 +1,11 @@
-"""Evaluation in several processes, and without a reader of its output."""
+"""Evaluation in several processes, and as a process of its own."""
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +14,39 @@ import pytest
 from mavbridge.commands.evaluate import evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.stopping import INTERRUPTED, ONE_REQUEST_NS
 
 pytestmark = pytest.mark.system
 
+POLICY = """
+import threading
+import numpy as np
+from policy.contract import Contract
+
+
+class Single:
+    contract = Contract(arrays="numpy")
+
+    def predict(self, image, state, history, steps):
+        return np.zeros((1, 16, 4), np.float32)
+
+
+class Hanging(Single):
+    instances = 0
+
+    def __init__(self):
+        Hanging.instances += 1
+
+    def reset(self):
+        self.flies = True
+
+    def predict(self, image, state, history, steps):
+        if Hanging.instances == 2 and hasattr(self, "flies"):
+            print("hangs", flush=True)
+            threading.Event().wait()
+        return super().predict(image, state, history, steps)
+"""
 CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
 
 
@@ -31,20 +64,41 @@ def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
     assert (tmp_path / "1.json").read_bytes() == (tmp_path / "2.json").read_bytes()
 
 
+def evaluation(folder: Path, policy: str, output: int, *flags: str) -> subprocess.Popen[str]:
+    """Evaluate into flown.json; ``policy`` may be a class of POLICY."""
+    (folder / "mine.py").write_text(POLICY)
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-m", "mavbridge", "evaluate", "--policy", policy),
+            *("--max-time", "1", "--json", "flown.json", *flags),
+        ],
+        cwd=folder,
+        stdout=output,
+        stderr=output,
+        text=True,
+    )
+
+
 @pytest.mark.parametrize("open_ends", [os.pipe, os.openpty])
 def test_flights_are_written_although_the_reader_has_gone(
     tmp_path: Path, open_ends: Callable[[], tuple[int, int]]
 ) -> None:
     reader, writer = open_ends()
     os.close(reader)
-    flags = "--policy scripted:circle --episodes 1 --max-time 1 --json flown.json"
-    ended = subprocess.run(
-        [sys.executable, "-m", "mavbridge", "evaluate", *flags.split()],
-        cwd=tmp_path,
-        stdout=writer,
-        stderr=writer,
-        timeout=120,
-        check=False,
-    )
+    flying = evaluation(tmp_path, "scripted:circle", writer, "--episodes", "1")
     os.close(writer)
-    assert (ended.returncode, (tmp_path / "flown.json").exists()) == (0, True)
+    assert (flying.wait(120), (tmp_path / "flown.json").exists()) == (0, True)
+
+
+def test_a_second_request_ends_a_policy_that_hangs_and_keeps_the_flights(tmp_path: Path) -> None:
+    with evaluation(tmp_path, "./mine.py:Hanging", subprocess.PIPE) as flying:
+        try:
+            assert any("hangs" in line for line in flying.stdout)
+            for _ in range(2):
+                flying.send_signal(signal.SIGTERM)
+                threading.Event().wait(2 * ONE_REQUEST_NS / NS_PER_S)
+            flying.communicate(timeout=60)
+        finally:
+            flying.kill()
+    assert flying.returncode == INTERRUPTED
+    assert len(json.loads((tmp_path / "flown.json").read_text())["episodes"]) == 1

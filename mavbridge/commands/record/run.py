@@ -73,7 +73,7 @@ def record(config: RecordConfig) -> int:
     cv2.setNumThreads(1)
     with ExitStack() as signals, ExitStack() as stack:  # signals: handled until all is closed
         session = _Session(config, clock, flight_console(), stack)
-        session.run(signals.enter_context(stop_on_signals()))
+        session.run(signals.enter_context(stop_on_signals(is_bounded=True)))
     return 0
 
 
