@@ -77,6 +77,8 @@ class GuardProcess:
         self._process = _spawn((theirs, their_samples), settings)
         theirs.close()
         their_samples.close()
+        for end in (ours, samples):  # a policy's forks must not hide our death from the guard
+            os.register_at_fork(after_in_child=end.close)
         self._early: list[FromGuard] = []
         """Messages received before ``listen``."""
         self.summary: GuardSummary | None = None

@@ -1,6 +1,7 @@
 """Producer's end of the writer process."""
 
 import multiprocessing
+import os
 import weakref
 from collections import deque
 from collections.abc import Callable
@@ -87,6 +88,8 @@ class VideoWriter:
         niceness = NICENESS if pressure == "online" else 0
         self._job = VideoJob(video, hz, rows, with_truth, niceness, tlog)
         self._pipe, self._process = start_process(self._job)
+        # A policy's forks must not hide the producer's death from the writer.
+        os.register_at_fork(after_in_child=self._pipe.close)
         self._resources = ExitStack()
         self._resources.callback(self._pipe.close)
         # A producer that ends without ``close`` must not wait for its writer.

@@ -1,6 +1,8 @@
 """The death of the guard, seen by the flight process, which then sends the last words."""
 
 import os
+import select
+import signal
 import socket
 import subprocess
 import threading
@@ -162,6 +164,20 @@ def test_newer_words_replace_those_before_and_keep_the_link(rig: Rig, link: Link
     rig.tick()
     rig.die()
     assert b"".join(link.heard()) == b"newer"
+
+
+def test_a_fork_of_the_policy_does_not_hide_the_death_of_the_flight_process(rig: Rig) -> None:
+    child = os.fork()
+    if child == 0:
+        signal.pause()
+    try:
+        rig.guard.close()
+        while not rig.port.is_closed:
+            assert select.select([rig.port], [], [], 10.0)[0]
+            rig.port.receive()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
 
 
 @pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])

@@ -154,3 +154,16 @@ def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
         allocate(ring_shape(20, 20))
     assert reserved[0].startswith("/dev/shm/")
     assert reserved[0].endswith("(deleted)"), "nothing stays, whoever is killed"
+
+
+def test_a_fork_of_the_policy_does_not_keep_the_writer(tmp_path: Path) -> None:
+    video = VideoWriter(tmp_path / "camera.mp4", pressure="online", hz=30)
+    child = os.fork()
+    if child == 0:
+        signal.pause()
+    try:
+        video.close()
+        assert video._process.exitcode == 0
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
