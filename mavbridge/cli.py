@@ -92,9 +92,11 @@ cli = App(
         show_default=_shown_default, converter=_exactly, json_list=False, json_dict=False
     ),
     error_formatter=_as_ours,
+    result_action="return_value",  # the default exits at once, past ``end_process``
 )
 cli.register_install_completion_command(help="Install completion for this shell (bash, zsh, fish).")
 cli.meta.error_formatter = _as_ours
+cli.meta.result_action = "return_value"
 for _flag in ("--help", "--version", "--install-completion"):
     cli[_flag].group = RARE
 

@@ -118,7 +118,8 @@ def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
 
     An ordinary exit flushes standard output and error, and blocks for ever if another thread sleeps
     in a write to them or their reader has stalled. Here the flush is tried for ``LAST_WORDS_S``; if
-    it does not succeed, the process exits at once, without exit handlers.
+    it does not succeed, the process exits at once, without exit handlers. It would also wait for
+    threads of a policy, which get ``LAST_WORDS_S``.
     """
 
     def finish(_stop: threading.Event) -> None:
@@ -127,9 +128,16 @@ def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             stream.flush()
 
+    def end_late(stop: threading.Event) -> None:
+        threading.main_thread().join()  # it ends first, then the interpreter waits for the others
+        stop.wait(LAST_WORDS_S)
+        os._exit(status)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would cut the last words short
     last_words = Worker("mavbridge-last-words", finish)
     last_words.start()
     if not last_words.ends_within(LAST_WORDS_S):
         os._exit(status)
+    if any(not one.daemon for one in threading.enumerate() if one is not threading.main_thread()):
+        Worker("mavbridge-late-end", end_late).start()
     sys.exit(status)

@@ -32,6 +32,11 @@ class Single:
         return np.zeros((1, 16, 4), np.float32)
 
 
+class Untidy(Single):
+    def __init__(self):
+        threading.Thread(target=threading.Event().wait).start()
+
+
 class Hanging(Single):
     instances = 0
 
@@ -88,6 +93,14 @@ def test_flights_are_written_although_the_reader_has_gone(
     flying = evaluation(tmp_path, "scripted:circle", writer, "--episodes", "1")
     os.close(writer)
     assert (flying.wait(120), (tmp_path / "flown.json").exists()) == (0, True)
+
+
+def test_a_policy_that_leaves_a_thread_ends_in_order(tmp_path: Path) -> None:
+    flying = evaluation(tmp_path, "./mine.py:Untidy", subprocess.DEVNULL, "--episodes", "1")
+    try:
+        assert (flying.wait(120), (tmp_path / "flown.json").exists()) == (0, True)
+    finally:
+        flying.kill()
 
 
 def test_a_second_request_ends_a_policy_that_hangs_and_keeps_the_flights(tmp_path: Path) -> None:
