@@ -9,7 +9,6 @@ import http
 import logging
 import math
 import os
-import signal
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -27,6 +26,7 @@ from mavbridge.commands.output import text_console
 from mavbridge.core.address import is_local, spelled
 from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.stopping import stop_signals
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
@@ -203,7 +203,7 @@ def serve(config: ServeConfig) -> int:
 
 
 async def _serve(config: ServeConfig, server: PolicyServer, console: Console) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in stop_signals():
         asyncio.get_running_loop().add_signal_handler(number, server.end)
     listener = await server.listen(config.host, config.port)
     url = f"ws://{spelled(config.host, config.port)}"

@@ -60,9 +60,22 @@ class StopRequest:
         return self.is_set()
 
 
+def stop_signals() -> list[int]:
+    """Return the signals that end a command: SIGTERM, and SIGINT and SIGHUP where not ignored.
+
+    ``nohup`` ignores SIGHUP, and shells ignore SIGINT for programs that they start in the
+    background.
+    """
+    # SIGHUP: the terminal, or the connection to this computer, is gone.
+    names = ("SIGINT", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    handled = [one for one in numbers if signal.getsignal(one) is not signal.SIG_IGN]
+    return [signal.SIGTERM, *handled]
+
+
 @contextmanager
 def stop_on_signals(*, is_bounded: bool = False) -> Iterator[StopRequest]:
-    """Context manager: SIGINT, SIGTERM and SIGHUP request the stop.
+    """Context manager: the signals of ``stop_signals`` request the stop.
 
     The second request raises KeyboardInterrupt and the third exits at once, because a policy may
     hang, unless the block ``is_bounded``: it ends by deadlines of its own.
@@ -79,10 +92,7 @@ def stop_on_signals(*, is_bounded: bool = False) -> Iterator[StopRequest]:
             os._exit(128 + number)
         raise KeyboardInterrupt
 
-    # SIGHUP: the terminal, or the connection to this computer, is gone.
-    names = ("SIGINT", "SIGTERM", "SIGHUP")
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    previous = {number: signal.signal(number, on_signal) for number in numbers}
+    previous = {number: signal.signal(number, on_signal) for number in stop_signals()}
     try:
         yield stop
     finally:

@@ -120,6 +120,18 @@ def test_a_signal_wakes_who_waits() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_that_the_parent_has_ignored_stays_ignored(number: signal.Signals) -> None:
+    """As of ``nohup``, and of a shell for a program in the background."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as stop:
+            signal.raise_signal(number)
+            assert not stop.is_set()
+    finally:
+        signal.signal(number, before)
+
+
 def test_a_second_request_is_counted_and_a_burst_is_one() -> None:
     clock = FakeClock()
     stop = StopRequest(clock)
