@@ -120,14 +120,16 @@ class ObserverThread:
             return dropped
         return dropped + sum(map(len, queues)) + self._in_flight
 
-    def close(self, timeout_s: float) -> None:
-        """Let the consumer empty the queue and finish, for at most ``timeout_s``."""
+    def close(self, timeout_s: float) -> bool:
+        """Let the consumer empty the queue and finish, for at most ``timeout_s``; return whether
+        its thread has ended."""
         self._open = False
         self._closing.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             self._out_of_time.set()
             self._fail(f"did not finish within {timeout_s:g} s")
+        return not self._out_of_time.is_set()
 
     def _run(self) -> None:
         try:

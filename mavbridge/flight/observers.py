@@ -178,8 +178,7 @@ class FlightObservers:
         recorder, summary = self._recorder, self._guard.summary if self._guard else None
         if recorder is None or self._config.record is None:
             return
-        recorder.close(RECORDER_JOIN_S)
-        if recorder.meta.finished:
+        if recorder.close(RECORDER_JOIN_S):
             meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
             params = {} if summary is None else summary.params
             self._write_end(replace(meta, parameters=params), self._config.record)

@@ -82,6 +82,15 @@ class FlightMeta:
     parameters: dict[str, float] = field(default_factory=dict)
     """Flight-relevant parameters read from the autopilot, by name."""
 
+    @property
+    def loss(self) -> str | None:
+        """Missing part of the recording, in words; None if it was closed in order."""
+        if self.finished:
+            return None
+        if self.ticks is None:
+            return "cut off: shown up to its last whole batch of rows"
+        return "images lost: the process that writes the video died; all else is whole"
+
     def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
         """Add the outcome; derive ``success`` from it if it is not set yet."""
         success = outcome.success if self.success is None else self.success

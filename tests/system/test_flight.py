@@ -149,6 +149,20 @@ def test_a_signal_while_the_recording_is_closed_loses_nothing(tmp_path: Path) ->
     assert open_flight(folder).meta.finished
 
 
+def test_a_killed_writer_costs_the_images_and_not_the_outcome(tmp_path: Path) -> None:
+    folder = tmp_path / "recording"
+    with staged(tmp_path) as flying:
+        flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
+        assert flying.relay.has_flown.wait(60)
+        Process(flying.pid_of("recorder"), flying.clock).kill(signal.SIGKILL)
+        flying.observe(0.5)
+        flying.kill(signal.SIGTERM)
+        assert flying.end()[0] == 0
+    meta = open_flight(folder).meta
+    assert (meta.finished, meta.outcome is None, bool(meta.parameters)) == (False, False, True)
+    assert "images lost" in str(meta.loss)
+
+
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
     with staged(tmp_path) as flying:

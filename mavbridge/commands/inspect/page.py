@@ -85,8 +85,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
     if meta.crash is not None:
         yield "crashed", meta.crash, True
-    if not meta.finished:
-        yield "recording", "cut off: shown up to its last whole batch of rows", True
+    if meta.loss is not None:
+        yield "recording", meta.loss, True
     for text in flight.damage:
         yield "damage", text, True
     if meta.gates_passed is not None:

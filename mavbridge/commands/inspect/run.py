@@ -88,8 +88,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
     yield Text.assemble(
         (str(flight.folder), "bold"), f": {_SOURCES[meta.source]}, {meta.started_at}"
     )
-    if not meta.finished:
-        yield Text("cut off: it is shown up to its last whole batch of rows", style="yellow")
+    if meta.loss is not None:
+        yield Text(meta.loss, style="yellow")
     if meta.crash is not None:
         yield Text(f"crashed: {meta.crash}", style="red")
     if meta.outcome is not None:
@@ -183,7 +183,7 @@ def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:
     yield "engine", report.engine
     yield "vehicle", report.autopilot or "-"
     yield "loops", f"{meta.mode} rate"
-    end = "in order" if meta.finished else "cut off"
+    end = "in order" if meta.finished or meta.ticks is not None else "cut off"
     yield "ended", end if meta.crash is None else "crashed"
 
 
