@@ -4,6 +4,7 @@
 ``mavbridge``.
 """
 
+import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,14 +67,18 @@ def warned(text: str) -> Warned:
 def user_code(doing: str) -> Iterator[None]:
     """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
 
-    The message begins with ``doing``. A ``PolicyError`` passes unchanged. ``sys.exit`` is converted
-    too: it would end the flight silently, with an arbitrary status.
+    The message begins with ``doing``. A ``PolicyError`` passes unchanged, and so does
+    ``KeyboardInterrupt`` on the main thread, which Ctrl-C raises. Any other ``BaseException`` is
+    converted too: ``sys.exit`` would end the flight silently, with an arbitrary status.
     """
     try:
         yield
     except PolicyError:
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        is_main = threading.current_thread() is threading.main_thread()
+        if isinstance(error, GeneratorExit) or (isinstance(error, KeyboardInterrupt) and is_main):
+            raise
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         told = lines[-1] if "Traceback" in str(error) else " ".join(lines)
         raise PolicyError(f"{doing}: {type(error).__name__}: {told}{user_line(error)}") from error

@@ -3,8 +3,8 @@
 ``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, chdir, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -64,6 +64,19 @@ def check_request(request: PolicyRequest) -> Contract | None:
     return contract
 
 
+@contextmanager
+def _folder_kept() -> Iterator[None]:
+    """Context manager: return to the working directory if a policy's code has left it.
+
+    Output files are relative to it.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError):  # it was deleted, or is closed to this user
+            stack.enter_context(chdir(Path.cwd()))
+        yield
+
+
+@_folder_kept()
 def read_policy_contract(request: PolicyRequest) -> Contract:
     """Return the contract of a policy, without loading a built-in network."""
     contract = check_request(request)
@@ -77,6 +90,7 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
     return contract
 
 
+@_folder_kept()
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
     """Find, build, load, try and time a policy.
 

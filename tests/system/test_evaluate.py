@@ -20,6 +20,7 @@ from mavbridge.core.stopping import INTERRUPTED, ONE_REQUEST_NS
 pytestmark = pytest.mark.system
 
 POLICY = """
+import os
 import threading
 import numpy as np
 from policy.contract import Contract
@@ -34,6 +35,7 @@ class Single:
 
 class Untidy(Single):
     def __init__(self):
+        os.chdir("/")
         threading.Thread(target=threading.Event().wait).start()
 
 
@@ -95,7 +97,7 @@ def test_flights_are_written_although_the_reader_has_gone(
     assert (flying.wait(120), (tmp_path / "flown.json").exists()) == (0, True)
 
 
-def test_a_policy_that_leaves_a_thread_ends_in_order(tmp_path: Path) -> None:
+def test_a_policy_that_leaves_a_thread_and_another_folder_ends_in_order(tmp_path: Path) -> None:
     flying = evaluation(tmp_path, "./mine.py:Untidy", subprocess.DEVNULL, "--episodes", "1")
     try:
         assert (flying.wait(120), (tmp_path / "flown.json").exists()) == (0, True)

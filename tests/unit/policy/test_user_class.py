@@ -1,11 +1,13 @@
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from helpers.loaded_policies import act, load
-from policy.errors import PolicyError
+from mavbridge.core.workers import Worker
+from policy.errors import PolicyError, user_code
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
@@ -105,6 +107,7 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
         ("def (:", r"SyntaxError.*broken\.py"),
         ("raise ValueError('no camera here')", r"ValueError: no camera here \(.*broken\.py:1\)"),
         ("raise SystemExit('no')", r"SystemExit: no \(.*broken\.py:1\)"),
+        ("import asyncio; raise asyncio.CancelledError('no')", r"CancelledError: no \("),
         ("import no_such_library", "install no_such_library beside mavbridge"),
         ("from .neighbour import VALUE", "import its neighbours by their plain names"),
         (
@@ -119,6 +122,19 @@ def test_a_file_that_cannot_be_imported_says_why(folder: Path, code: str, messag
     for _ in range(2):  # nothing half imported is left behind
         with pytest.raises(PolicyError, match=message):
             load("./broken.py:Flying")
+
+
+def test_an_interrupt_is_a_failure_but_for_ctrl_c_on_the_main_thread() -> None:
+    def fly(_stop: threading.Event) -> None:
+        with user_code("mine failed"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fly(threading.Event())
+    worker = Worker("mavbridge-policy", fly)
+    worker.start()
+    with pytest.raises(PolicyError, match="mine failed: KeyboardInterrupt"):
+        worker.join(10.0)
 
 
 MINE = """
