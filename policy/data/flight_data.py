@@ -39,9 +39,9 @@ class FlightData:
     state: FloatArray
     """[T, 13] state as flown; NaN if it is unknown or must not be imitated."""
     attitude_ns: Nanoseconds
-    """[T] arrival of the attitude: the first action of a chunk acts then."""
+    """[T] measurement of the attitude: the first action of a chunk acts then."""
     velocity_ns: Nanoseconds
-    """[T] arrival of the velocity."""
+    """[T] measurement of the velocity."""
     target_ns: Nanoseconds
     target: FloatArray
     """[M, 4] sticks to imitate, at ``target_ns`` [M]; for a flight by rates, the sticks that

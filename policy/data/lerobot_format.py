@@ -27,7 +27,7 @@ CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT = (
 )
 STAMPS = (CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT)
 """mavbridge's columns with the true stamps of a row: exposure of the image, tick of the state,
-arrival of its attitude and velocity, stamp of the action, stamp of the sticks that flew.
+measurement of its attitude and velocity, stamp of the action, stamp of the sticks that flew.
 
 LeRobot takes every feature whose name begins with "observation" or "action" for an input or output
 of its policies (``utils/feature_utils.py:dataset_to_policy_features``), so these begin with

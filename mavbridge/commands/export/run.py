@@ -1,8 +1,7 @@
 """``mavbridge export``: flights in, a LeRobot dataset out, complete or not at all.
 
-A row holds the data known at the exposure of its image: the state of the newest tick whose messages
-had all arrived by then, and the newest sticks to imitate up to then. Nothing is interpolated; the
-stamps give the age of each.
+A row holds the data known at the exposure of its image: the newest state measured by then, and
+the newest sticks to imitate up to then. Nothing is interpolated; the stamps give the age of each.
 """
 
 import signal
@@ -68,12 +67,12 @@ class Stretch:
 def stretches(episode: FlightData) -> list[Stretch]:
     """Align a flight to its frames, and leave out frames without a state or sticks."""
     captured_ns = episode.captured_ns
-    arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
-    tick = _newest(arrived_ns, captured_ns)
+    measured_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
+    tick = _newest(measured_ns, captured_ns)
     target = _newest(episode.target_ns, captured_ns)
     sent = _newest(episode.sent_ns, captured_ns)
     is_known = (tick >= 0) & (target >= 0)
-    is_known &= captured_ns - arrived_ns[tick] <= MAX_HELD_NS
+    is_known &= captured_ns - measured_ns[tick] <= MAX_HELD_NS
     is_known &= captured_ns - episode.target_ns[target] <= MAX_HELD_NS
     is_known &= np.isfinite(episode.state[tick]).all(axis=1)
     # If nothing had been sent yet, index -1 selects the appended row.
