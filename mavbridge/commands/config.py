@@ -119,7 +119,8 @@ class ExportConfig:
     task: str = "fly"
     """Task in words, for policies that take one."""
     include_failed: Annotated[bool, Parameter(negative="")] = False
-    """Also flights that crashed, ended by a fault, were marked as bad, or missed gates."""
+    """Also flights that crashed, were cut off, ended by a fault, were marked as bad, or missed
+    gates."""
     image_size: int | None = None
     """Height and width of the images, as the policy is to see them; by default as recorded."""
     state: Literal["world", "body"] = "world"

@@ -71,7 +71,8 @@ class RunSettings:
     """Validations in the run, evenly spaced; one every two minutes or fifty steps, 4 to 20, if not
     given."""
     include_failed: bool = False
-    """Learn from flights, too, that crashed, were marked as bad, or missed gates."""
+    """Also flights that crashed, were cut off, ended by a fault, were marked as bad, or missed
+    gates."""
     camera_key: str | None = None
     """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
 
