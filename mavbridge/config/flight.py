@@ -159,6 +159,12 @@ class LinkConfig(ListenConfig):
         return tuple(read.items())
 
 
+def split_camera(text: str) -> tuple[str, str]:
+    """Split a value of ``--camera`` into name and source; the name is empty if not given."""
+    name, equals, source = text.partition("=")
+    return (name, source) if equals and name.isidentifier() else ("", text)
+
+
 @Parameter(name="*", group=CAMERA)
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig(Ranged):
@@ -188,10 +194,7 @@ class CameraConfig(Ranged):
     @property
     def _named(self) -> tuple[tuple[str, str], ...]:
         """Name and source of each camera; the name is empty if not given."""
-        return tuple(
-            (name, source) if equals and name.isidentifier() else ("", name + equals + source)
-            for name, equals, source in (text.partition("=") for text in self.camera)
-        )
+        return tuple(map(split_camera, self.camera))
 
     @property
     def sources(self) -> tuple[str, ...]:

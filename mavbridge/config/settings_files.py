@@ -12,6 +12,7 @@ from cyclopts import App
 from cyclopts.argument import ArgumentCollection, update_argument_collection
 from cyclopts.config import Dict
 
+from mavbridge.config.flight import split_camera
 from mavbridge.core.errors import UserError
 from policy.files import user_path
 
@@ -64,8 +65,7 @@ def _foreign(key: str, value: str) -> str | None:
     if key == "policy":
         return foreign_policy(value)
     if key == "camera":
-        source = re.sub(r"^[A-Za-z_]\w*=", "", value)
-        return "a program" if source.startswith("pipe:") else None
+        return "a program" if split_camera(value)[1].startswith("pipe:") else None
     if key in _ADDRESS_KEYS and (not _LOCAL.match(value) or (key == "host" and not value)):
         return "another computer, or a port that is open to others"
     if key in _OUTPUT_KEYS and (value.startswith(("/", "~")) or ".." in Path(value).parts):

@@ -150,6 +150,7 @@ REFUSED = [
     ('policy = "ws://127.0.0.1:80@evil.example:8000"', "--policy"),
     (f'camera = ["{PIPE}"]', "--camera"),
     (f'camera = "front={PIPE}"', "--camera"),
+    (f'camera = "été={PIPE}"', "--camera"),
     (f'[fly]\ncamera = "{PIPE}"', "--camera"),
     (f'"--camera" = "{PIPE}"', "--camera"),
     (f'CAMERA = "{PIPE}"', "--camera"),
