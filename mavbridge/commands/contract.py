@@ -27,7 +27,7 @@ def contract(source: Path, config: ContractConfig) -> int:
     """
     source = Path(str(source).removeprefix("lerobot:").removeprefix("onnx:"))
     out = config.out or (source if source.is_dir() else source.parent) / CONTRACT_FILE
-    if out.exists():
+    if out.exists() or out.is_symlink():  # a link of a stranger may lead anywhere
         raise UserError(f"{out} is there already: change that, or name another file by --out")
     text, summary = _draft(source, config.dataset)
     write_output(out, text, "--out")

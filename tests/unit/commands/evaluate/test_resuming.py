@@ -90,6 +90,13 @@ def test_a_full_disk_ends_the_evaluation_and_keeps_its_results(
     assert [*config.json.parent.iterdir()] == [config.json]
 
 
+def test_a_link_planted_for_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / f"out.{os.getpid()}").symlink_to(tmp_path / "victim")
+    with pytest.raises(UserError, match="File exists"):
+        write_output(tmp_path / "out.json", "text", "--json")
+    assert not (tmp_path / "victim").exists()
+
+
 @pytest.mark.parametrize("number", [errno.EBUSY, errno.EROFS])
 def test_a_file_that_cannot_be_replaced_is_written_in_place(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
