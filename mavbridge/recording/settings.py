@@ -3,8 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from types import NoneType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.errors import MavbridgeError
@@ -46,7 +45,7 @@ def read_settings(folder: Path) -> ReplaySettings:
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise SettingsError(
             f"{folder / SETTINGS} is damaged, or of another version: {error}"
-        ) from (error)
+        ) from error
 
 
 def _made(cls: type[_T], document: dict[str, Any]) -> _T:
@@ -57,11 +56,15 @@ def _made(cls: type[_T], document: dict[str, Any]) -> _T:
 
 
 def _value(hint: Any, value: Any) -> Any:
+    """Convert a value of JSON to the type of its field; raise TypeError if it has another one."""
     if is_dataclass(hint) and isinstance(hint, type):
         return _made(hint, value)
-    kinds = get_args(hint)
-    if value is None and NoneType in kinds:
-        return None
-    if hint is Path or Path in kinds:
+    kinds = get_args(hint) or (hint,)
+    if get_origin(hint) is tuple:
+        return tuple(_value(kinds[0], each) for each in _value(list, value))
+    if Path in kinds and isinstance(value, str):
         return Path(value)
-    return tuple(value) if get_origin(hint) is tuple else value
+    is_choice = get_origin(hint) is Literal and value in kinds
+    if is_choice or type(value) in kinds or (type(value) is int and float in kinds):
+        return value
+    raise TypeError(f"{value!r} is no {hint}")

@@ -137,9 +137,16 @@ def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Pat
     (tmp_path / SETTINGS).write_text(json.dumps(document))
     assert read_settings(tmp_path) == settings
 
-    (tmp_path / SETTINGS).write_text("{")
-    with pytest.raises(SettingsError, match="damaged"):
-        read_settings(tmp_path)
+    for damaged in (
+        "{",
+        '{"wall_offset_ns": "1", "config": {}}',
+        '{"wall_offset_ns": 1, "config": {"policy": {"policy": 3}}}',
+        '{"wall_offset_ns": 1, "config": {"link": {"set": "A=1"}}}',
+        '{"wall_offset_ns": 1, "config": {"link": {"output": "flags"}}}',
+    ):
+        (tmp_path / SETTINGS).write_text(damaged)
+        with pytest.raises(SettingsError, match="damaged"):
+            read_settings(tmp_path)
     (tmp_path / SETTINGS).unlink()
     with pytest.raises(SettingsError, match="older mavbridge"):
         read_settings(tmp_path)
