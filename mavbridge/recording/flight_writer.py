@@ -24,6 +24,7 @@ from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogPipe
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError, WriterError
+from mavbridge.recording.video.writer_process import VideoJob
 
 PACKET_CAPACITY = 60_000
 """Capacity of the queue of packet stamps: one minute of the busiest link."""
@@ -97,17 +98,16 @@ class FlightWriter:
     def _start_videos(
         self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
     ) -> None:
-        job = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
+        tlog = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
         for camera in self._names:
-            video = VideoWriter(
-                self._folder / video_of(camera),
-                pressure=pressure,
+            job = VideoJob(
+                video=self._folder / video_of(camera),
                 hz=self.meta.visual_hz,
                 rows=self._folder / frames_of(camera),
                 with_truth=with_truth,
-                tlog=job if camera is None else None,
+                tlog=tlog if camera is None else None,
             )
-            self._videos.append(video)
+            self._videos.append(VideoWriter(job, pressure=pressure))
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
         self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)

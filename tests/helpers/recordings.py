@@ -17,7 +17,6 @@ from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.tlog import TlogJob
 from mavbridge.recording.video.writer_process import FrameFiles, VideoJob
 from policy.contract import Contract
 
@@ -80,19 +79,10 @@ class InProcessWriter:
     pid = None
     lost = 0
 
-    def __init__(
-        self,
-        video: Path,
-        *,
-        pressure: str,
-        hz: float,
-        rows: Path | None = None,
-        with_truth: bool = False,
-        tlog: TlogJob | None = None,
-    ) -> None:
-        if tlog is not None:
-            tlog.records.close()
-        self._files = FrameFiles(VideoJob(video, hz, rows, with_truth))
+    def __init__(self, job: VideoJob, *, pressure: str) -> None:
+        if job.tlog is not None:
+            job.tlog.records.close()
+        self._files = FrameFiles(job)
         self._is_open = True
         self.size: tuple[int, int] | None = None
         self.written = 0

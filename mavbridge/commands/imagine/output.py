@@ -34,6 +34,7 @@ from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS
 from mavbridge.recording.video.writer import VideoWriter
+from mavbridge.recording.video.writer_process import VideoJob
 from policy.contract import ACTION_DIM, STATE_DIM
 
 SCHEMA = pa.schema(
@@ -129,7 +130,7 @@ class StreamedOutput:
             self._table = TableWriter(out, SCHEMA)
         if decode_video:
             try:
-                self.video = VideoWriter(out, pressure="offline", hz=1 / self._frame_dt_s)
+                self.video = VideoWriter(VideoJob(out, 1 / self._frame_dt_s), pressure="offline")
             except BaseException:
                 self._table.abandon()
                 raise

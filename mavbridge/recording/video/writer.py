@@ -9,13 +9,11 @@ from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Literal
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.tlog import TlogJob
 from mavbridge.recording.video.ring import FrameRing, allocate, ring_shape, send_descriptor
 from mavbridge.recording.video.writer_process import (
     NICENESS,
@@ -54,25 +52,10 @@ class VideoWriter:
     by then, and waits for that by itself.
     """
 
-    def __init__(
-        self,
-        video: Path,
-        *,
-        pressure: Pressure,
-        hz: float,
-        rows: Path | None = None,
-        with_truth: bool = False,
-        tlog: TlogJob | None = None,
-    ) -> None:
-        """Start the process and wait until it runs.
+    def __init__(self, job: VideoJob, *, pressure: Pressure) -> None:
+        """Start the process and wait until it runs. The pipe of the job's log is closed here.
 
-        Args:
-            video: MP4 file to make; must not exist.
-            pressure: behaviour with a full ring. Online, the process yields the CPU to all others.
-            hz: nominal frame rate.
-            rows: path and stem of a table of frames to write, or None.
-            with_truth: the table has the columns of ``FrameTruth``.
-            tlog: log of the link to write beside the video; its pipe is closed here.
+        ``pressure``: behaviour with a full ring. Online, the process yields the CPU to all others.
         """
         self._pressure: Pressure = pressure
         self._ring: FrameRing | None = None
@@ -85,9 +68,8 @@ class VideoWriter:
         """Why a frame was dropped that the video cannot have; None if there was none."""
         self.written = 0
         """Number of frames known to be in the file."""
-        niceness = NICENESS if pressure == "online" else 0
-        self._job = VideoJob(video, hz, rows, with_truth, niceness, tlog)
-        self._pipe, self._process = start_process(self._job)
+        self._keeps_log = job.tlog is not None
+        self._pipe, self._process = start_process(job, NICENESS if pressure == "online" else 0)
         # A policy's forks must not hide the producer's death from the writer.
         os.register_at_fork(after_in_child=self._pipe.close)
         self._resources = ExitStack()
@@ -230,7 +212,7 @@ class VideoWriter:
         """End the process; frames submitted but not written can be lost. Can be called twice."""
         self._resources.close()
         self._process.join(END_S)
-        is_keeping_log = self._job.tlog is not None and Notice.DONE in self._notices
+        is_keeping_log = self._keeps_log and Notice.DONE in self._notices
         if self._process.is_alive() and not is_keeping_log:
             self._process.kill()
             self._process.join(END_S)
@@ -241,12 +223,14 @@ class VideoWriter:
         return self._process.pid
 
 
-def start_process(job: VideoJob) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
+def start_process(
+    job: VideoJob, niceness: int
+) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
     """Start the writer's process; return the pipe to it and the process."""
     context = multiprocessing.get_context("spawn")  # not fork: this process has running threads
     pipe, its_pipe = context.Pipe()
     process = context.Process(
-        target=run_writer, args=(its_pipe, job), name="mavbridge-writer", daemon=True
+        target=run_writer, args=(its_pipe, job, niceness), name="mavbridge-writer", daemon=True
     )
     try:
         process.start()

@@ -30,10 +30,11 @@ class VideoJob(NamedTuple):
     video: Path
     """Fragmented MP4; must not exist."""
     hz: float
+    """Nominal frame rate."""
     rows: Path | None = None
     """Path and stem of the frames table; None: only a video."""
     with_truth: bool = False
-    niceness: int = 0
+    """The table has the columns of ``FrameTruth``."""
     tlog: TlogJob | None = None
     """Log of the link to write beside the video."""
 
@@ -138,12 +139,12 @@ ToWriter: TypeAlias = RingShape | Submit | Notice
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
-def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
+def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness: int) -> None:
     """Entry point of the process."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    os.nice(job.niceness)
+    os.nice(niceness)
     tlog = None if job.tlog is None else TlogThread(job.tlog)
     service = WriterService(pipe, job, tlog)
     service.send(Notice.READY)

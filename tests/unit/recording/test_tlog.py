@@ -15,6 +15,7 @@ from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
 from mavbridge.recording.video.file import count_frames
 from mavbridge.recording.video.writer import VideoWriter, WriterError
+from mavbridge.recording.video.writer_process import VideoJob
 
 DEADLINE_S = 30.0
 
@@ -44,7 +45,7 @@ def link(pipe: TlogPipe) -> Iterator[PacketPipe]:
 @pytest.fixture
 def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWriter]:
     job = TlogJob(tmp_path / "link.tlog", pipe.reader)
-    made = VideoWriter(tmp_path / "camera.mp4", pressure="online", hz=30, tlog=job)
+    made = VideoWriter(VideoJob(tmp_path / "camera.mp4", 30, tlog=job), pressure="online")
     yield made
     made.close()
 

@@ -26,9 +26,8 @@ DEADLINE_S = 30.0
 
 
 def writer(folder: Path, pressure: Pressure) -> closing[VideoWriter]:
-    return closing(
-        VideoWriter(folder / "camera.mp4", pressure=pressure, hz=30, rows=folder / "frames")
-    )
+    job = VideoJob(folder / "camera.mp4", hz=30, rows=folder / "frames")
+    return closing(VideoWriter(job, pressure=pressure))
 
 
 def read_back(folder: Path) -> tuple[list[int], list[int]]:
@@ -48,7 +47,8 @@ def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> Non
 
 
 def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
-    with closing(VideoWriter(tmp_path / "odd.mp4", pressure="offline", hz=10)) as video:
+    job = VideoJob(tmp_path / "odd.mp4", hz=10)
+    with closing(VideoWriter(job, pressure="offline")) as video:
         for k in range(3):
             video.submit(picture(k, height=49, width=67), make_row(k))
         assert video.size == (48, 66)
@@ -102,10 +102,11 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         folder = Path(name)
         video, table = folder / "camera.mp4", folder / "frames"
         ours, its = Pipe()
-        service = WriterService(its, VideoJob(video, hz=30, rows=table))
+        job = VideoJob(video, hz=30, rows=table)
+        service = WriterService(its, job)
         service.send(Notice.READY)
         with patch.object(writer_module, "start_process", lambda *_: (ours, Alive())):
-            sender = VideoWriter(video, pressure="online", hz=30, rows=table)
+            sender = VideoWriter(job, pressure="online")
         offered = lost_upstream = 0
         taken: list[int] = []
         for step in steps:
