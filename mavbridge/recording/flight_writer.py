@@ -1,7 +1,7 @@
 """Single-threaded writer of a flight's folder: tables, videos and meta."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -44,6 +44,19 @@ class SerialNumbers:
         return skipped
 
 
+@dataclass
+class _Camera:
+    """Files of one camera."""
+
+    name: str | None
+    """Name in file names; None for the first camera."""
+    video: VideoWriter
+    features: TableWriter | None = None
+    serials: SerialNumbers = field(default_factory=SerialNumbers)
+    is_dead: bool = False
+    """True if the writer process has died: its frames are lost."""
+
+
 class FlightWriter:
     """Writer used during the flight; ``finish`` closes the files in order.
 
@@ -76,17 +89,14 @@ class FlightWriter:
         self._flushed_ns = meta.start_ns
         self._serials, self._solve_serials = SerialNumbers(), SerialNumbers(first=1)
         self._tables: list[TableWriter] = []
-        self._videos: list[VideoWriter] = []
-        """One for each camera, in the contract's order."""
-        self._dead: set[int] = set()
+        self._cameras: list[_Camera] = []
+        """In the contract's order."""
         self.video_failure: WriterDiedError | None = None
         """Why frames of a camera are no longer recorded while the rest is."""
         self._source_size: tuple[int, int] | None = None
         self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
         """Groups of packets in order of arrival; filled by another thread."""
         self._packets_lost = 0
-        self._names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
-        self._frame_serials = [SerialNumbers() for _ in self._names]
         try:
             self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
             write_meta(folder, meta)
@@ -99,25 +109,23 @@ class FlightWriter:
         self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
     ) -> None:
         tlog = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
-        for camera in self._names:
+        for name in (None, *(self.meta.contract.cameras[1:] if self.meta.contract else ())):
             job = VideoJob(
-                video=self._folder / video_of(camera),
+                video=self._folder / video_of(name),
                 hz=self.meta.visual_hz,
-                rows=self._folder / frames_of(camera),
+                rows=self._folder / frames_of(name),
                 with_truth=with_truth,
-                tlog=tlog if camera is None else None,
+                tlog=tlog if name is None else None,
             )
-            self._videos.append(VideoWriter(job, pressure=pressure))
+            self._cameras.append(_Camera(name, VideoWriter(job, pressure=pressure)))
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
         self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
         self._solves = self._table(SOLVES, replay_tables.SOLVES) if with_replay else None
         self._packets = self._table(PACKETS, replay_tables.PACKETS) if with_replay else None
-        has_features = with_replay and self.meta.mode == "dual"  # else only resized images
-        self._features = [
-            (self._table(features_of(camera), replay_tables.FEATURES), SerialNumbers())
-            for camera in (self._names if has_features else ())
-        ]
+        if with_replay and self.meta.mode == "dual":  # else features are only resized images
+            for camera in self._cameras:
+                camera.features = self._table(features_of(camera.name), replay_tables.FEATURES)
 
     def _table(self, stem: str, schema: pa.Schema) -> TableWriter:
         table = TableWriter(self._folder / stem, schema)
@@ -134,13 +142,11 @@ class FlightWriter:
 
         If a writer process dies, only its frames are lost: see ``video_failure``.
         """
-        if self._features and vision.feature is not None:
-            table, serials = self._features[vision.camera]
-            table.add(
-                replay_tables.feature_columns(vision, vision.feature, serials.take(vision.serial))
-            )
+        camera = self._cameras[vision.camera]
+        dropped = camera.serials.take(vision.serial)
+        if camera.features is not None and vision.feature is not None:
+            camera.features.add(replay_tables.feature_columns(vision, vision.feature, dropped))
         self._flush_if_due(vision.ready_ns)
-        dropped = self._frame_serials[vision.camera].take(vision.serial)
         if vision.camera == 0 and self._source_size is None:
             self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
         row = FrameRow(
@@ -150,16 +156,16 @@ class FlightWriter:
             dropped_before=dropped,
             truth=truth,
         )
-        self._act(vision.camera, lambda video: video.submit(vision.rgb, row))
+        self._act(camera, lambda video: video.submit(vision.rgb, row))
 
-    def _act(self, camera: int, act: Callable[[VideoWriter], object]) -> None:
+    def _act(self, camera: _Camera, act: Callable[[VideoWriter], object]) -> None:
         """Use the writer of a camera; its death loses only its frames."""
-        if camera in self._dead:
+        if camera.is_dead:
             return
         try:
-            act(self._videos[camera])
+            act(camera.video)
         except WriterDiedError as error:
-            self._dead.add(camera)
+            camera.is_dead = True
             self.video_failure = self.video_failure or error
 
     def solve(self, solve: Solve) -> None:
@@ -187,13 +193,13 @@ class FlightWriter:
     @property
     def images_failure(self) -> str | None:
         """Why images are missing although the rest is recorded; None: no known reason."""
-        reasons = (self.video_failure, *(video.misfit for video in self._videos))
+        reasons = (self.video_failure, *(camera.video.misfit for camera in self._cameras))
         return next((str(reason) for reason in reasons if reason), None)
 
     @property
     def frames_written(self) -> int:
         """Number of frames known to be in the videos."""
-        return sum(video.written for video in self._videos)
+        return sum(camera.video.written for camera in self._cameras)
 
     @property
     def ticks(self) -> int:
@@ -209,14 +215,14 @@ class FlightWriter:
             self.flush()
             for table in self._tables:
                 table.finish()
-            for camera in range(len(self._videos)):
+            for camera in self._cameras:
                 self._act(camera, lambda video: video.finish())
         except BaseException:
             self.close()
             raise
         is_whole = self.video_failure is None
-        first = self._videos[0]
-        height, width = first.size or (None, None)
+        first = self._cameras[0]
+        height, width = first.video.size or (None, None)
         source_height, source_width = self._source_size or (None, None)
         self.meta = replace(
             meta,
@@ -226,15 +232,15 @@ class FlightWriter:
             source_width=source_width,
             finished=is_whole,
             ticks=self._ticks.rows,
-            frames=first.written if is_whole else None,
+            frames=first.video.written if is_whole else None,
             ticks_dropped=self._serials.dropped,
-            frames_dropped=self._frame_serials[0].next - first.written,
+            frames_dropped=first.serials.next - first.video.written,
         )
         write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""
-        for video in self._videos:
-            video.close()
+        for camera in self._cameras:
+            camera.video.close()
         for table in self._tables:
             table.abandon()
