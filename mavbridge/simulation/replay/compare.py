@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ActionTrace
+from mavbridge.core.records import Solve, Tick
+from mavbridge.core.vehicle import Action, ActionTrace
 from mavbridge.guard.guard import GuardOutput
-from mavbridge.simulation.replay.guard import GuardStep, same_action
+from mavbridge.guard.wire import GuardTick
+from mavbridge.recording.rows import STATE_STAMPS, attributes
+from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
 
 Array: TypeAlias = NDArray[np.float64]
 STAGES = ("raw", "clipped", "slewed", "smoothed")
-INPUTS = ("state", "stamps", "states", "history", "images")
 PAST_INPUTS = ("states", "history")
 """Inputs that a policy with the recorded contract gets from the recording. Rebuilt ones may differ
 if the recording lacks a solve without a chunk, or a tick in transit."""
@@ -107,7 +109,7 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
             reason = pair.refusal or because(Code.NO_CHUNK)
             missing[sentences.setdefault(reason.key, str(reason))] += 1
             continue
-        inputs.update(_other_inputs(pair))
+        inputs.update(_differing(_inputs(pair.recorded), _inputs(pair.replayed)))
         one, other = pair.recorded.actions, pair.replayed.actions
         if one.shape != other.shape:
             missing[f"its chunk has {other.shape[1]} actions instead of {one.shape[1]}"] += 1
@@ -123,25 +125,20 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
     )
 
 
-def _other_inputs(pair: SolvePair) -> list[str]:
-    """Return the names of the inputs that differ from the recording."""
-    one, other = pair.recorded, pair.replayed
-    if other is None:
-        return []
-    stamps = [
-        (s.state.attitude_ns, s.state.rate_ns, s.state.velocity_ns, s.state.specific_force_ns)
-        for s in (one, other)
-    ]
-    is_same = {
-        "state": one.state.values.tobytes() == other.state.values.tobytes()
-        and one.state.extras == other.state.extras,
-        "stamps": stamps[0] == stamps[1]
-        and (one.image_ns, one.first_ns) == (other.image_ns, other.first_ns),
-        "states": one.states.tobytes() == other.states.tobytes(),
-        "history": one.history.tobytes() == other.history.tobytes(),
-        "images": one.frame_ids == other.frame_ids,
+def _inputs(solve: Solve) -> dict[str, object]:
+    """Return the inputs of a solve by name, arrays as bytes."""
+    state = solve.state
+    return {
+        "state": (state.values.tobytes(), state.extras),
+        "stamps": (attributes(state, STATE_STAMPS), solve.image_ns, solve.first_ns),
+        "states": solve.states.tobytes(),
+        "history": solve.history.tobytes(),
+        "images": solve.frame_ids,
     }
-    return [name for name in INPUTS if not is_same[name]]
+
+
+def _differing(one: Mapping[str, object], other: Mapping[str, object]) -> list[str]:
+    return [name for name in one if one[name] != other[name]]
 
 
 def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
@@ -169,16 +166,18 @@ def _other_results(step: GuardStep) -> list[str]:
     if other is None:
         is_told = one.trace is not None or one.sent is not None or one.is_slot
         return ["ticks"] if is_told else []
-    is_same = {
-        "phase": one.phase == other.phase.value,
-        "chunk": one.chunk_serial == other.chunk_serial,
-        **{
-            stage: same_action(getattr(one.trace, stage, None), getattr(other.trace, stage, None))
-            for stage in STAGES
-        },
-        "sent": same_action(one.sent, other.sent),
-    }
-    return [name for name in is_same if not is_same[name]]
+    return _differing(_results(one, one.phase), _results(other, other.phase.value))
+
+
+def _results(tick: Tick | GuardTick, phase: str | None) -> dict[str, object]:
+    """Return the results of a pass by name, in single precision, that of a recording."""
+    stages = {stage: getattr(tick.trace, stage, None) for stage in STAGES}
+    actions = {name: _single(action) for name, action in (stages | {"sent": tick.sent}).items()}
+    return {"phase": phase, "chunk": tick.chunk_serial, **actions}
+
+
+def _single(action: Action | None) -> list[float] | None:
+    return None if action is None else np.array(action, np.float32).tolist()
 
 
 def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:

@@ -10,13 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
-import numpy as np
-
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
-from mavbridge.core.vehicle import Action, LinkSnapshot
+from mavbridge.core.vehicle import LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
@@ -201,13 +199,6 @@ class _WatchedLink(MavlinkLink):
         """See ``MavlinkLink``."""
         self.newest = super().snapshot()
         return self.newest
-
-
-def same_action(one: Action | None, other: Action | None) -> bool:
-    """True if equal in single precision, the precision of a recording."""
-    if one is None or other is None:
-        return one is other
-    return np.array_equal(np.array(one, np.float32), np.array(other, np.float32))
 
 
 def _link(

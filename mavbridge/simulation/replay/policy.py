@@ -12,7 +12,6 @@ rebuilt here. Both are compared.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -28,12 +27,11 @@ from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardStatus, GuardTick, Samples
 from mavbridge.mavlink.session.telemetry import PacketDecoder
+from mavbridge.recording.rows import STATE_STAMPS
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
 from mavbridge.simulation.replay.recording import ReplaySource
 from policy.protocol import PolicyRunner
-
-_SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,11 +215,8 @@ class _News:
         )
 
     def _bring_samples(self, solve: Solve) -> bool:
-        state = solve.state
-        wanted = (state.attitude_ns, state.rate_ns, state.velocity_ns, state.specific_force_ns)
-        first, last = (
-            int(np.searchsorted(self._stamps[:, 0], state.attitude_ns, side)) for side in _SIDES
-        )
+        wanted = [getattr(solve.state, name) for name in STATE_STAMPS]
+        first, last = np.searchsorted(self._stamps[:, 0], (wanted[0], wanted[0] + 1))
         places = first + np.flatnonzero((self._stamps[first:last] == wanted).all(axis=1))
         found = next((place for place in places.tolist() if self._has_extras(place, solve)), None)
         if found is None:
