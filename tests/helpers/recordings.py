@@ -19,6 +19,7 @@ from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.video.writer_process import FrameFiles, VideoJob
 from policy.contract import Contract
+from policy.data.flight_video import video_parts
 
 _BITS = 12
 _BLOCK = 16
@@ -40,6 +41,11 @@ def number_of(rgb: ImageArray) -> int:
         int(rgb[_BLOCK * (bit // 4) + half, _BLOCK * (bit % 4) + half, 1] > 127) << bit
         for bit in range(_BITS)
     )
+
+
+def count_frames(path: Path) -> int:
+    """Return the number of whole frames of a video."""
+    return len(video_parts(path).fragments)
 
 
 def make_frame(number: int, **changes: Any) -> VisionTick:
@@ -77,7 +83,6 @@ class InProcessWriter:
     """Replaces ``VideoWriter`` where its process is not under test: starting it takes a second."""
 
     pid = None
-    lost = 0
 
     def __init__(self, job: VideoJob, *, pressure: str) -> None:
         if job.tlog is not None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
-from helpers.recordings import write_recording
+from helpers.recordings import count_frames, write_recording
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
@@ -28,7 +28,6 @@ from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.tables import read_table
-from mavbridge.recording.video.file import count_frames
 from policy.contract import Contract
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel

@@ -17,7 +17,7 @@ from av.error import FFmpegError
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
-from policy.data.flight_video import VideoParts, decode_images, video_parts
+from policy.data.flight_video import decode_images, video_parts
 
 CRF = "20"
 """Constant quality. 17 to 18 counts as visually lossless; 23 is x264's default."""
@@ -95,19 +95,6 @@ class FragmentedMp4:
             self._file.close()
 
 
-def count_frames(path: Path) -> int:
-    """Count the complete frames of a ``FragmentedMp4`` file; raise VideoError on failure."""
-    return len(find_images(path).fragments)
-
-
-def find_images(path: Path) -> VideoParts:
-    """Find the decodable parts of a ``FragmentedMp4`` file; raise VideoError on failure."""
-    try:
-        return video_parts(path)
-    except OSError as error:
-        raise VideoError(f"{path} cannot be read: {error.strerror}") from error
-
-
 def read_video(path: Path, numbers: Sequence[int] | None = None) -> Iterator[CameraImage]:
     """Return the images of a ``FragmentedMp4`` file, complete or not, in the order of appending.
 
@@ -116,7 +103,10 @@ def read_video(path: Path, numbers: Sequence[int] | None = None) -> Iterator[Cam
     """
     if numbers is not None and not len(numbers):
         return
-    parts = find_images(path)
+    try:
+        parts = video_parts(path)
+    except OSError as error:
+        raise VideoError(f"{path} cannot be read: {error.strerror}") from error
     wanted = [each.number for each in parts.fragments] if numbers is None else numbers
     seen = 0
     try:

@@ -63,7 +63,6 @@ class VideoWriter:
         self._failure: WriterError | None = None
         self._pending_drops = 0
         self._notices: set[Notice] = set()
-        self._offered = 0
         self.misfit: str | None = None
         """Why a frame was dropped that the video cannot have; None if there was none."""
         self.written = 0
@@ -87,11 +86,6 @@ class VideoWriter:
         """Height and width of the recorded frames; None before the first."""
         return None if self._ring is None else (self._ring.shape.height, self._ring.shape.width)
 
-    @property
-    def lost(self) -> int:
-        """Number of offered frames that are not, or not yet, in the file."""
-        return self._offered - self.written
-
     def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
         """Hand a frame over; the caller can overwrite it afterwards.
 
@@ -105,7 +99,6 @@ class VideoWriter:
         Returns:
             True if it was taken.
         """
-        self._offered += 1
         self._receive()
         height, width = rgb.shape[:2]
         rgb = rgb[: height // 2 * 2, : width // 2 * 2]

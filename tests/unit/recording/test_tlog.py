@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from helpers.recordings import make_row, picture
+from helpers.recordings import count_frames, make_row, picture
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
-from mavbridge.recording.video.file import count_frames
 from mavbridge.recording.video.writer import VideoWriter, WriterError
 from mavbridge.recording.video.writer_process import VideoJob
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from helpers.factories import FRAME_NS, START_NS
-from helpers.recordings import number_of, picture
+from helpers.recordings import count_frames, number_of, picture
 from mavbridge.core.records import ImageArray
-from mavbridge.recording.video.file import FragmentedMp4, VideoError, count_frames, read_video
+from mavbridge.recording.video.file import FragmentedMp4, VideoError, read_video
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import decode_video
 from policy.data.flight_video import video_parts
@@ -98,7 +98,7 @@ def test_an_image_that_is_damaged_inside_is_refused(path: Path) -> None:
 
 def test_errors_say_what_is_wrong(path: Path) -> None:
     with pytest.raises(VideoError, match="cannot be read"):
-        count_frames(path)
+        list(read_video(path))
     path.write_bytes(b"no video")
     with pytest.raises(VideoError, match="cannot be decoded after 0 images: 3 of 3 images"):
         list(read_video(path, range(3)))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.recordings import count_frames
 from helpers.rollouts import (
     SIZE,
     Finished,
@@ -19,7 +20,7 @@ from helpers.rollouts import (
     segments,
 )
 from mavbridge.commands.imagine.loop import NoiseStage, RolloutPlan
-from mavbridge.recording.video.file import count_frames, read_video
+from mavbridge.recording.video.file import read_video
 
 THREAD = "mavbridge-rollout-decode"
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
+from helpers.recordings import count_frames
 from helpers.rollouts import TinyWorld, read_rows, write_flight
 from helpers.status import told_by
 from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import Sampler
-from mavbridge.recording.video.file import count_frames
 from policy.checkpoints.networks import save_world_model
 
 Imagine = Callable[..., tuple[int, str]]

@@ -13,14 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.recordings import send_signal
+from helpers.recordings import count_frames, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video.file import count_frames, read_video
+from mavbridge.recording.video.file import read_video
 
 DEADLINE_S = 60.0
 PLAN = make_plan(iterations=1000)
