@@ -210,7 +210,8 @@ class Engagement(Memory):
         link = replace(now.link, are_sticks_at_rest=False)
         status = replace(now.status, mode_arrived_ns=None)
         now = replace(now, link=link, status=status, heard_ns=None)
-        rest_ns = STICK_REST_NS if now.link.modes.override else 0
+        rests = bool(now.link.modes.override) and not self.settings.is_setpoint
+        rest_ns = STICK_REST_NS if rests else 0
         until_ns = rest_ns + _ASKED_NS
         for after_ns in (after_ms * NS_PER_MS for after_ms in _REHEARSED_MS):
             if after_ns > until_ns:

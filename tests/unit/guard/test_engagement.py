@@ -361,6 +361,10 @@ def asked() -> Stepped:
             lambda: flying(PX4),
             asking("AUTO.LOITER", (1000, 1100, 1200), (0, 20, 40, *range(100, 1251, 50))),
         ),
+        (
+            lambda: flying(altered(PX4, mode="OFFBOARD"), is_setpoint=True, modes=("OFFBOARD",)),
+            asking("AUTO.LOITER", (0, 100, 200)),
+        ),
     ],
 )
 def test_the_words_of_a_guard_that_dies(start: Callable[[], Stepped], words: list[Any]) -> None:
