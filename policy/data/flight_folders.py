@@ -305,8 +305,9 @@ def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
 
 def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
     """Return the image's age at the decision behind each tick that had one."""
-    age = pc.subtract(pa.array(_decisions(name, ticks)), ticks["feature_captured_ns"])
-    return np.asarray(age.drop_null(), np.int64)
+    looked = ticks["feature_captured_ns"].is_valid()
+    captured_ns = stamps(name, ticks.filter(looked), "feature_captured_ns")
+    return _decisions(name, ticks)[looked.to_numpy()] - captured_ns
 
 
 def _known(values: FloatArray) -> NDArray[np.bool_]:
