@@ -305,9 +305,9 @@ def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
 
 def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
     """Return the image's age at the decision behind each tick that had one."""
-    looked = ticks["feature_captured_ns"].is_valid()
-    captured_ns = stamps(name, ticks.filter(looked), "feature_captured_ns")
-    return _decisions(name, ticks)[looked.to_numpy()] - captured_ns
+    looked: NDArray[np.bool_] = ticks["feature_captured_ns"].is_valid().to_numpy()
+    captured_ns = stamps(name, ticks.filter(pa.array(looked)), "feature_captured_ns")
+    return _decisions(name, ticks)[looked] - captured_ns
 
 
 def _known(values: FloatArray) -> NDArray[np.bool_]:
