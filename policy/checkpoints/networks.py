@@ -14,6 +14,7 @@ import re
 import struct
 import warnings
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,10 @@ from policy.checkpoints.header import (
 )
 from policy.checkpoints.tensors import (
     find_weights,
+    load_fitting,
     pack,
     read_tensors,
     require_finite,
-    require_fit,
     unpack,
     write_tensors,
 )
@@ -97,31 +98,28 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     everything that a ``.pt`` lacks.
     """
     require_file(path, SUFFIXES)
-    is_ours = path.suffix == ".safetensors"
-    if is_ours:
+    config, vector = fallback, {}
+    if path.suffix == ".safetensors":
         header, tensors = read_tensors(path)
         require_header(path, header)
+        try:
+            config = _config_of(header, type(fallback))
+        except (PolicyError, RecursionError) as error:
+            is_ours = isinstance(error, PolicyError)
+            told = str(error) if is_ours else "its header is nested too deeply"
+            raise CheckpointError(f"{path}: {told}") from error
+        vector = {
+            name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
+            for name in list(tensors)
+            if name.startswith(VECTOR_PREFIX)
+        }
+        state = unpack(tensors)
     else:
-        header, tensors = {}, _read_torch(path)
-    try:
-        policy = build_policy(_config_of(header, type(fallback)) if is_ours else fallback)
-    except (PolicyError, RecursionError) as error:
-        told = str(error) if isinstance(error, PolicyError) else "its header is nested too deeply"
-        raise CheckpointError(f"{path}: {told}") from error
-    vector = {
-        name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
-        for name in list(tensors)
-        if name.startswith(VECTOR_PREFIX)
-    }
-    require_finite(path, vector)
-    state = unpack(tensors)
-    require_finite(path, state)
-    require_fit(
-        *(path, policy, state),
+        state = _read_torch(path)
+    policy = load_fitting(
+        *(path, partial(build_policy, config), state),
         "Name the size and encoder of its training, as in --policy toge:medium:resnet18",
     )
-    policy.load_state_dict(state)
-    policy.eval()
     if vector:
         _require_reproduced(path, policy, vector)
     return policy
@@ -151,6 +149,13 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
     damaged = f"{path}: its test vector is damaged"
     if set(vector) != set(VECTOR_NAMES):
         raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
+    kinds = {name: torch.uint8 if name == "rgb" else torch.float32 for name in VECTOR_NAMES}
+    if bad := [name for name, kind in kinds.items() if vector[name].dtype != kind]:
+        raise CheckpointError(
+            f"{damaged}: its {bad[0]} must be {kinds[bad[0]]}, not {vector[bad[0]].dtype}; copy "
+            "the file again"
+        )
+    require_finite(path, vector)
     rgb, state, history, chunks = (vector[name].numpy() for name in VECTOR_NAMES)
     try:
         made = _chunks(policy, ParitySamples(rgb=rgb, state=state, history=history))
@@ -229,15 +234,12 @@ def load_world_model(path: Path) -> WorldModel:
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
         held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
         raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
-    require_finite(path, state)
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
-        model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
-    except (
-        *(PolicyError, ArithmeticError, LookupError),
-        *(TypeError, ValueError, RuntimeError),
-    ) as error:
+        config = WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract)
+    except (PolicyError, RecursionError) as error:
         raise CheckpointError(f"{path}: {error}") from error
-    require_fit(path, model, state, "Train it again with this version of mavbridge")
-    model.load_state_dict(state)
-    return model.eval()
+    return load_fitting(
+        *(path, partial(WorldModel, config), state),
+        "Train it again with this version of mavbridge",
+    )

@@ -1,16 +1,18 @@
 """Reading, writing and checking of weight files of any network; faults are ``CheckpointError``."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
+from torch.overrides import TorchFunctionMode
 
-from policy.errors import CheckpointError
+from policy.errors import CheckpointError, PolicyError
 from policy.files import open_safetensors, whole_file
 
 SCALE = ".int8_scale"
@@ -18,6 +20,16 @@ SCALE = ".int8_scale"
 _LARGEST = 127.0
 USUAL_KEYS = ("state_dict", "model_state_dict")
 """Keys of the weights in a file of ``torch.save``."""
+_COUNT = "num_batches_tracked"
+"""End of the name of an integer."""
+_REAL = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_UNBUILDABLE = (PolicyError, ArithmeticError, LookupError, TypeError, ValueError, RuntimeError)
+"""Exceptions of networks for sizes that nothing has."""
+_SPARE = 10_000_000
+"""Numbers that a network may have besides those of its file."""
+_LEAST = 1000
+"""Cost of a small tensor in numbers."""
+Net = TypeVar("Net", bound=nn.Module)
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
@@ -46,16 +58,62 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
         )
 
 
-def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advice: str) -> None:
+class _Budget(TorchFunctionMode):
+    """Raises PolicyError where a network asks for more numbers than its file has.
+
+    A header of a few bytes may ask for any size, and for any number of layers. The meta device
+    could tell, too, but torch imports its compiler for it, in 2 s.
+    """
+
+    def __init__(self, state: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self._file_has = sum(value.numel() for value in state.values())
+        self._left = _SPARE + 2 * self._file_has + 2 * _LEAST * len(state)
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if func in (torch.empty, torch.ones, torch.randn, torch.zeros):
+            sizes = args[0] if args and isinstance(args[0], Sequence) else args
+            self._left -= max(_LEAST, math.prod(sizes))
+            if self._left < 0:
+                raise PolicyError(
+                    f"asks for a far larger network than its {self._file_has} weights"
+                )
+        return func(*args, **(kwargs or {}))
+
+
+def load_fitting(
+    path: Path, build: Callable[[], Net], state: Mapping[str, Tensor], advice: str
+) -> Net:
+    """Build a network and load its weights; return it in eval mode.
+
+    Batch counts may be missing: only training uses them.
+    """
+    try:
+        with _Budget(state):
+            net = build()
+    except _UNBUILDABLE as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    _require_fit(path, net.state_dict(), state, advice)
+    net.load_state_dict(state, strict=False)
+    require_finite(path, net.state_dict())
+    return net.eval()
+
+
+def _require_fit(
+    path: Path, wanted: Mapping[str, Tensor], state: Mapping[str, Tensor], advice: str
+) -> None:
     """Raise CheckpointError with the first misfits and the next step; torch would list hundreds."""
-    wanted = {name: list(value.shape) for name, value in policy.state_dict().items()}
-    problems = [f"missing {name!r}" for name in wanted if name not in state]
+    missing = [name for name in wanted if name not in state]
+    problems = [f"missing {name!r}" for name in missing if not name.endswith(_COUNT)]
     problems += [f"unexpected {name!r}" for name in state if name not in wanted]
-    problems += [
-        f"{name!r} is {list(state[name].shape)}, must be {shape}"
-        for name, shape in wanted.items()
-        if name in state and list(state[name].shape) != shape
-    ]
+    for name, value in state.items():
+        if name in wanted and (shape := list(wanted[name].shape)) != list(value.shape):
+            problems.append(f"{name!r} is {list(value.shape)}, must be {shape}")
+        is_plain = value.layout == torch.strided and not value.is_meta
+        if not is_plain or (value.dtype not in _REAL and not name.endswith(_COUNT)):
+            problems.append(f"{name!r} is no dense tensor of real numbers, but {value.dtype}")
     if problems:
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "
@@ -85,14 +143,15 @@ def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
 
 
 def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return a file's weights as float32; weights that are not packed stay unchanged."""
-    state: dict[str, Tensor] = {}
+    """Return a file's weights with int8 as float32; what is not packed so stays unchanged."""
+    state = dict(packed)
     for name, value in packed.items():
         scale = packed.get(name + SCALE)
-        if scale is not None:
-            state[name] = value.float() * scale.view(-1, *[1] * (value.ndim - 1))
-        elif not name.endswith(SCALE):
-            state[name] = value.float() if value.dtype == torch.float16 else value
+        if scale is None or (value.dtype, scale.dtype) != (torch.int8, torch.float32):
+            continue
+        if scale.shape == value.shape[:1]:
+            state[name] = value * scale.view(-1, *[1] * (value.ndim - 1))
+            del state[name + SCALE]
     return state
 
 

@@ -17,6 +17,7 @@ from policy.errors import CheckpointError, warned
 from policy.files import read_object
 
 CONFIG_FILE = "config.json"
+_MAX_TRAIN_STEPS = 10_000
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
@@ -178,7 +179,11 @@ def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
     resize, crop = _resize_and_crop(entries, features)
     if features.state_dim is None:
         raise CheckpointError(f"{entries.path}: a diffusion policy takes {STATE_KEY}")
-    train_steps = entries.get("num_train_timesteps", int)
+    if (train_steps := entries.get("num_train_timesteps", int)) > _MAX_TRAIN_STEPS:
+        raise CheckpointError(
+            f"{entries.path}: num_train_timesteps must be at most {_MAX_TRAIN_STEPS}, got "
+            f"{train_steps}: copy the file again"
+        )
     config = entries.fill(
         DiffusionConfig,
         features=features,

@@ -1,15 +1,16 @@
 """LeRobot policies behind the policy protocol: the contract's images and states to its actions."""
 
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from policy.adapters.lerobot.act import Act
-from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
+from policy.adapters.lerobot.config import ActConfig
 from policy.adapters.lerobot.diffusion import Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
-from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
+from policy.checkpoints.tensors import load_fitting, read_tensors
 from policy.contract import Contract
 from policy.protocol import predict_by_pair
 
@@ -93,9 +94,9 @@ class LeRobotDiffusion(LeRobotPolicy):
 
     net: Diffusion
 
-    def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
-        super().__init__(plan, Diffusion(config))
-        self.schedule = self.net.schedule
+    def __init__(self, plan: Plan, net: Diffusion) -> None:
+        super().__init__(plan, net)
+        self.schedule = net.schedule
 
     @property
     def initial_noise(self) -> Tensor:
@@ -123,12 +124,15 @@ def load_policy_of(
     plan: Plan, *, seed: int, num_diffusion_steps: int
 ) -> tuple[LeRobotPolicy, list[str]]:
     """Build a policy, load its weights, draw the initial noise; return notes for the user too."""
+    path, advice = plan.folder / WEIGHTS_FILE, "Copy both files again, from one folder"
     policy: LeRobotPolicy
     if isinstance(plan.config, ActConfig):
-        policy = LeRobotPolicy(plan, Act(plan.config))
+        act = partial(Act, plan.config)
+        policy = LeRobotPolicy(plan, load_fitting(path, act, _read(path, Act), advice))
     else:
-        policy = LeRobotDiffusion(plan, plan.config)
-    policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
+        diffusion = partial(Diffusion, plan.config)
+        net = load_fitting(path, diffusion, _read(path, Diffusion), advice)
+        policy = LeRobotDiffusion(plan, net)
     policy.eval().requires_grad_(False)
     config, kind = plan.config, "ACT" if isinstance(plan.config, ActConfig) else "DiffusionPolicy"
     millions = sum(parameter.numel() for parameter in policy.parameters()) / 1e6
@@ -148,15 +152,11 @@ def load_policy_of(
     return policy, notes
 
 
-def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
+def _read(path: Path, net: type[Act | Diffusion]) -> dict[str, Tensor]:
     """Return the weights of LeRobot's file under our names."""
-    # Batch counts may be missing: only training uses them.
-    own = net.state_dict().items()
-    state = {name: value for name, value in own if name.endswith("num_batches_tracked")}
+    state = {}
     for name, value in read_tensors(path)[1].items():
         ours = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
         if ours is not None:
             state[ours] = value
-    require_finite(path, state)
-    require_fit(path, net, state, "Copy both files again, from one folder")
     return state

@@ -63,6 +63,7 @@ def test_the_contract_has_what_the_files_say(folder, tmp_path_factory):
         ({"down_dims": [16, 32, 64, 128]}, "a horizon of 8 does not suit"),
         ({"down_dims": []}, "down_dims must be positive integers"),
         ({"crop_shape": [65, 65]}, "cannot crop"),
+        ({"num_train_timesteps": 10**9}, "num_train_timesteps must be at most 10000"),
         ({"kernel_size": True}, "kernel_size must be a positive integer"),
         ({"clip_sample": 1}, "clip_sample must be true or false"),
         ({"use_peft": True}, "merge"),

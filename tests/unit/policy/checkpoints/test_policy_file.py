@@ -69,7 +69,7 @@ def test_each_packed_weight_is_off_by_at_most_half_a_step() -> None:
     step = conv.flatten(1).abs().amax(dim=1) / 127
     off = (state.pop("backbone.conv.weight") - conv).flatten(1).abs().amax(dim=1)
     assert bool((off <= 0.5001 * step).all() and (off > 0).any())
-    torch.testing.assert_close(state, plain, rtol=2**-11, atol=0)
+    torch.testing.assert_close(state, plain, rtol=2**-11, atol=0, check_dtype=False)
 
 
 Change = str | dict[str, Any] | None
@@ -118,7 +118,8 @@ def test_headers_of_another_build_are_refused(
     ("name", "change", "message"),
     [
         ("test_vector.chunks", lambda x: x + 0.02, r"off by 0\.02.*damaged"),
-        ("test_vector.rgb", lambda x: x.float(), "test vector is damaged: an image must be"),
+        ("test_vector.rgb", lambda x: x.float(), "test vector is damaged: its rgb must be .*uint8"),
+        ("test_vector.state", lambda x: x.bfloat16(), "damaged: its state must be .*float32"),
         ("test_vector.state", lambda x: x[:, :12], "test vector is damaged: .*copy the file"),
         ("test_vector.history", None, "test vector is damaged: it must hold"),
         ("head.unet.out.weight", lambda x: -x, "do not make the sticks that they made"),
@@ -216,6 +217,14 @@ def test_state_dicts_load_bare_and_as_training_loops_save_them(small_toge, tmp_p
             r"missing 'fusion\.mlp\.0\.weight'",
         ),
         (lambda s: {**s, "surprise": torch.zeros(3)}, "unexpected 'surprise'"),
+        (lambda s: {**s, "vast": torch.zeros(1).expand(1 << 40)}, "unexpected 'vast'"),
+        (lambda s: {**s, NAME: s[NAME].to_sparse()}, f"'{NAME}' is no dense tensor of real"),
+        (lambda s: {**s, NAME: s[NAME].to("meta")}, f"'{NAME}' is no dense tensor of real"),
+        (lambda s: {**s, NAME: s[NAME].double() * 1e300}, f"NaN or infinity.*'{NAME}'"),
+        *(
+            (lambda s, dtype=dtype: {**s, NAME: s[NAME].to(dtype)}, f"real numbers, but {dtype}")
+            for dtype in (torch.int8, torch.bool, torch.complex64, torch.float8_e4m3fn)
+        ),
         (lambda s: {**s, NAME: torch.zeros(3, 7)}, r"is \[3, 7\], must be \[512"),
         (
             lambda s: Toge(TogeConfig(backbone="resnet18")).state_dict(),

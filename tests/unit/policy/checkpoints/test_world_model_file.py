@@ -79,6 +79,8 @@ def test_what_cannot_be_written_is_told_and_leaves_the_file_before(model, tmp_pa
         ({"world_model": "[" * 100_000}, {}, "malformed"),
         ({"world_model": replace(CONFIG, frames=8).to_json()}, {}, "frame_position"),
         ({"world_model": replace(CONFIG, autoencoder_widths=()).to_json()}, {}, "out of range"),
+        ({"world_model": replace(CONFIG, dynamics_width=10**6).to_json()}, {}, "far larger"),
+        ({"world_model": replace(CONFIG, dynamics_depth=10**9).to_json()}, {}, "far larger"),
         ({"contract": "{}x"}, {}, "not JSON"),
         ({}, {"action_std": torch.full((4,), float("inf"))}, "NaN or infinity.*action_std"),
         ({}, {"action_std": torch.ones(5)}, r"'action_std' is \[5\], must be \[4\]"),
