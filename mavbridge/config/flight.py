@@ -185,6 +185,8 @@ class CameraConfig(Ranged):
         """Raise UserError for times that no camera has, and for cameras without names."""
         super().__post_init__()
         names = [name for name, _ in self._named]
+        if not names:
+            raise UserError("camera is an empty list: name a camera, or none")
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
             raise UserError(
                 f"--camera {' '.join(self.camera)}: with several cameras each has a name of its "

@@ -47,3 +47,8 @@ def test_names_that_the_policy_does_not_have_are_refused(
 def test_several_cameras_have_different_names(given: tuple[str, ...]) -> None:
     with pytest.raises(UserError, match="each has a name of its own"):
         CameraConfig(camera=given)
+
+
+def test_an_empty_list_of_cameras_is_refused() -> None:
+    with pytest.raises(UserError, match="an empty list: name a camera"):
+        CameraConfig(camera=())
