@@ -120,7 +120,7 @@ def read_numbered(
     stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read the table as ``read_table`` does, with the row numbers from before any loss."""
-    table, numbers = read_rows(stem, [] if damage is None else damage)
+    table, numbers = read_rows(stem, [] if damage is None else damage, schema.names)
     if not table.column_names:
         table = schema.empty_table()
     missing = [

@@ -275,7 +275,7 @@ def _require_learnable(name: str, contract: Contract) -> None:
 def _read_table(
     folder: Path, stem: str, columns: tuple[str, ...], damage: list[str]
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    table, numbers = read_rows(folder / stem, damage)
+    table, numbers = read_rows(folder / stem, damage, columns)
     if missing := [name for name in columns if name not in table.column_names]:
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
     if table.num_rows == 0 and stem == "ticks":

@@ -28,11 +28,12 @@ from policy.contract import (
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
-from policy.data.tables import number_column, stamps, vectors
+from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
 from policy.files import library_name, read_object, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
 """Path templates: fields with these names, a few digits wide."""
+_MAX_EPISODES = 100_000
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
@@ -168,9 +169,16 @@ def _read_episodes(info: _Info) -> list[_Row]:
     if info.is_video:
         each = ("chunk_index", "file_index", "from_timestamp")
         columns += [f"videos/{info.camera}/{name}" for name in each]
-    table = pa.concat_tables([_read_table(file, columns) for file in files])
-    if table.num_rows == 0:
-        raise DatasetError(f"{info.folder}: no episodes in it")
+    try:
+        table = pa.concat_tables([_read_table(file, columns, _MAX_EPISODES) for file in files])
+    except pa.ArrowException as error:
+        raise DatasetError(
+            f"{info.folder}: its meta/episodes differ in columns: {error}"
+        ) from error
+    if not 0 < table.num_rows <= _MAX_EPISODES:
+        raise DatasetError(
+            f"{info.folder}: {table.num_rows} episodes in it; must be 1 to {_MAX_EPISODES}"
+        )
     return [_row(info, values) for values in table.to_pylist()]
 
 
@@ -189,7 +197,9 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
             )
         from_s = float(values[f"{prefix}from_timestamp"]) if info.is_video else 0.0
         length = int(values["length"])
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+        if not math.isfinite(from_s):
+            raise ValueError(f"from_timestamp {from_s}")
+    except (KeyError, IndexError, OverflowError, TypeError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
     if length < 1:
         raise DatasetError(f"{name}: meta/episodes says that it has {length} rows: remove it")
@@ -203,11 +213,14 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
     )
 
 
-def _read_table(path: Path, columns: Sequence[str]) -> pa.Table:
+def _read_table(path: Path, columns: Sequence[str], max_rows: int = MAX_ROWS) -> pa.Table:
     try:
-        has = pq.read_schema(library_name(path)).names
+        metadata = pq.read_metadata(library_name(path))
+        has = metadata.schema.to_arrow_schema().names
         if missing := [name for name in columns if name not in has]:
             raise DatasetError(f"{path} lacks {missing}, which meta/info.json promises")
+        if metadata.num_rows > max_rows:
+            raise DatasetError(f"{path} has {metadata.num_rows} rows, more than {max_rows}")
         return pq.read_table(library_name(path), columns=list(columns), partitioning=None)
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is not there: copy the dataset again, whole") from error

@@ -1,5 +1,6 @@
 """Reading of JSON and Arrow columns; faults are raised as ``DatasetError``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,12 @@ from policy.files import library_name
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
+
+_LABELS = (
+    *("expert", "position_ned_m", "ned_from_body_wxyz", "velocity_ned_mps", "next_gate"),
+    *("gate_body_m", "gate_yaw_rad", "gate_after_body_m"),
+)
+"""Columns that only demonstrations have."""
 
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
@@ -50,8 +57,13 @@ def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
     return out
 
 
-def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+def read_rows(
+    stem: Path, damage: list[str], columns: Sequence[str]
+) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read a table of a flight, complete or not; sentences about lost rows go to ``damage``.
+
+    A complete table is read in these ``columns`` and those of demonstrations, where it has them:
+    a stranger's other columns could have any size.
 
     Returns:
         The readable rows and their indices; for an empty file, no columns.
@@ -61,9 +73,11 @@ def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64
             flight can have.
     """
     parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
-    path, read = (parquet, _read_groups) if parquet.exists() else (stream, _read_batches)
+    path = parquet if parquet.exists() else stream
     try:
-        return read(path, damage)
+        if path == stream:
+            return _read_batches(path, damage)
+        return _read_groups(path, damage, (*columns, *_LABELS))
     except FileNotFoundError as error:
         raise DatasetError(
             f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
@@ -93,7 +107,9 @@ def _read_batches(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.i
     return table, np.arange(table.num_rows)
 
 
-def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+def _read_groups(
+    path: Path, damage: list[str], columns: Sequence[str]
+) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read the undamaged row groups of a Parquet file."""
     groups, numbers, count = [], [np.zeros(0, np.int64)], 0
     failure: Exception | None = None
@@ -105,7 +121,7 @@ def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.in
         for index in range(file.num_row_groups):
             rows = file.metadata.row_group(index).num_rows
             try:
-                groups.append(file.read_row_group(index))
+                groups.append(file.read_row_group(index, columns))
                 numbers.append(np.arange(count, count + groups[-1].num_rows))
             except (pa.ArrowException, OSError) as error:
                 failure = error

@@ -24,6 +24,8 @@ from mavbridge.commands.inspect.analysis import analyse
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.meta import read_meta
+from mavbridge.recording.rows import TICKS
+from mavbridge.recording.tables import read_table
 from mavbridge.simulation.replay.recording import open_source
 from policy.adapters.interface import read_interface
 from policy.checkpoints.header import read_contract
@@ -230,3 +232,11 @@ def test_a_table_of_more_rows_than_any_flight_is_refused(tmp_path: Path) -> None
     assert ticks.num_rows < MAX_ROWS
     with pytest.raises(MavbridgeError, match="more rows than a flight has"):
         open_flight(folder)
+
+
+def test_a_column_that_nobody_asked_for_is_not_read(tmp_path: Path) -> None:
+    """A few kilobytes of Parquet can hold any number of equal texts."""
+    ticks = pq.read_table(FLIGHT / "ticks.parquet")
+    wide = ticks.append_column("wide", pa.repeat(pa.scalar("x" * 1000), ticks.num_rows))
+    pq.write_table(wide, tmp_path / "ticks.parquet", compression="zstd")
+    assert read_table(tmp_path / "ticks", TICKS).column_names == TICKS.names

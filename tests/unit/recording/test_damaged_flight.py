@@ -38,9 +38,9 @@ def spoil(path: Path, start: int, end: int) -> None:
 
 
 def spoil_second_group(path: Path) -> int:
-    """Damage the last bytes of a column, which are values; returns the rows of the group."""
+    """Damage the last bytes of woke_ns, which are values; returns the rows of the group."""
     group = pq.read_metadata(path).row_group(1)
-    column = group.column(0)
+    column = group.column(2)
     start = column.dictionary_page_offset or column.data_page_offset
     end = start + column.total_compressed_size
     spoil(path, end - 4, end)

@@ -110,6 +110,7 @@ def test_the_frame_of_the_state_is_where_gravity_says(tmp_path: Path) -> None:
         read_dataset(tmp_path / "a", "tail")
 
 
+BEGIN = f"videos/{CAMERA}/from_timestamp"
 Spoil = Callable[[Path], None]
 TWO_CAMERAS = {"observation.images.tail": COLOUR}
 
@@ -143,6 +144,12 @@ def _nan(values: list[Any]) -> list[Any]:
     return [*values[:3], [np.nan] * len(values[3]), *values[4:]]
 
 
+def _other_types(root: Path) -> None:
+    table = pq.read_table(root / EPISODES)
+    texts = table.set_column(1, "length", table["length"].cast(pa.string()))
+    pq.write_table(texts, (root / EPISODES).with_name("file-001.parquet"))
+
+
 def _scalar_state(table: pa.Table) -> pa.Table:
     return table.set_column(0, "observation.state", pa.array(np.zeros(table.num_rows, "f4")))
 
@@ -164,6 +171,9 @@ def _scalar_state(table: pa.Table) -> pa.Table:
         (_rows("timestamp", lambda v: [3 * t for t in v]), "row 11 is 0.88 s off: .* 1 / 25 s"),
         (_rows("timestamp", lambda v: [0.0] * len(v)), "row 11 is 0.44 s off"),
         (_rows("length", lambda v: [12, 0], EPISODES), "has 0 rows"),
+        (_rows(BEGIN, lambda v: [0.0, np.nan], EPISODES), "from_timestamp nan"),
+        (_table(lambda t: t.take([0] * 100_001), EPISODES), "has 100001 rows, more than 100000"),
+        (_other_types, "meta/episodes differ in columns"),
         (_table(lambda table: table.drop_columns(["action"])), "lacks .*action"),
         (_table(lambda table: table.slice(0, 15)), "holds 3 rows"),
         (_table(_scalar_state), "13 numbers a row"),
