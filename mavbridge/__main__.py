@@ -27,11 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None:
         interrupt_once()
     try:
-        from rich.console import Console
         from rich.markup import escape
 
         from mavbridge.cli import cli
-        from mavbridge.observe.output import survive_lost_readers
+        from mavbridge.observe.output import SafeConsole, survive_lost_readers
 
         if arguments is None:
             survive_lost_readers()
@@ -40,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         end_process(128 + signal.SIGINT)
     except MavbridgeError as error:
         message = f"[bold red]error:[/] {escape(without_secrets(str(error)))}"
-        console = Console(stderr=True, highlight=False, emoji=False)
+        console = SafeConsole(stderr=True, highlight=False, emoji=False)
         end_process(error.exit_code, partial(console.print, message, soft_wrap=True))
     end_process(status or 0)
 

@@ -36,6 +36,7 @@ from mavbridge.config.settings_files import (
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.log import run_log
+from mavbridge.core.provenance import printable
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.adapters.websocket.kind import require_packages as require_websocket
@@ -80,7 +81,7 @@ def _as_ours(error: CycloptsError) -> Text:
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
         text = f"unexpected word {' '.join(error.unused_tokens or ())!r}: flags begin with --"
-    return Text.assemble(("error: ", "bold red"), text)
+    return Text.assemble(("error: ", "bold red"), printable(text))
 
 
 cli = App(

@@ -19,6 +19,7 @@ from rich.table import Table
 from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable, write_output
 from mavbridge.core.provenance import without_secrets
+from mavbridge.observe.output import SafeConsole
 
 PIPED_WIDTH = 120
 """Columns of the tables if there is no terminal."""
@@ -69,7 +70,7 @@ def write_json(path: Path | None, document: object) -> None:
 
 def text_console(*, stderr: bool = False) -> Console:
     """Return a console that prints text as it is: a path may look like Rich's markup."""
-    return Console(stderr=stderr, highlight=False, emoji=False, markup=False)
+    return SafeConsole(stderr=stderr, highlight=False, emoji=False, markup=False)
 
 
 def print_warnings(console: Console, texts: Iterable[str]) -> None:

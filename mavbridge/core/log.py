@@ -15,7 +15,13 @@ from pathlib import Path
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.files import require_writable
-from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
+from mavbridge.core.provenance import (
+    command_line,
+    git_revision,
+    printable,
+    versions,
+    without_secrets,
+)
 from mavbridge.core.workers import HungError, Worker
 
 SAID = "mavbridge.said"
@@ -68,7 +74,7 @@ class _Terminal(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print the record unless the terminal has already shown it."""
         if record.name != SAID:
-            sys.stderr.write(f"{record.getMessage()}\n")
+            sys.stderr.write(f"{printable(record.getMessage())}\n")
 
 
 @contextmanager

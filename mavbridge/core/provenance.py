@@ -27,6 +27,8 @@ _NAMED_SECRET = re.compile(
 )
 """Matches in a query, and in a path as some cameras have it: /user=me_password=it_channel=1."""
 
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
 
 def command_line() -> tuple[str, ...]:
     """Return the words of this process's command line, with the secrets of addresses masked."""
@@ -40,6 +42,14 @@ def without_secrets(text: str) -> str:
     ``rtsp://me:***@host``, ``?token=abc`` becomes ``?token=***``.
     """
     return _NAMED_SECRET.sub(r"\1***", _USER_PASSWORD.sub(r"\1:***@", text))
+
+
+def printable(text: str) -> str:
+    """Make control codes visible, which could steer a terminal; line ends and tabs stay.
+
+    Used for what files, folders and servers say. Marks of writing direction are replaced as well.
+    """
+    return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def versions() -> dict[str, str]:

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO, cast
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+from mavbridge.core.provenance import printable
 
 POLL_S = 0.05
 """Interval at which a stalled write checks whether it was given up."""
@@ -70,12 +73,23 @@ class PatientOutput(io.TextIOBase):
         self._waiting = b"" if self._is_given_up else self._waiting
 
 
+class SafeConsole(Console):
+    """Console whose texts cannot steer the terminal; Rich's own styles and bars still can."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        """Render with ``printable`` texts."""
+        for part in super().render(renderable, options):
+            yield part if part.control else part._replace(text=printable(part.text))
+
+
 def flight_console() -> Console:
     """Return a console on standard error for ``FlightScreen``, its only user during a flight."""
     try:
-        return Console(file=cast(TextIO, PatientOutput(sys.stderr)), emoji=False)
+        return SafeConsole(file=cast(TextIO, PatientOutput(sys.stderr)), emoji=False)
     except (OSError, AttributeError):  # standard error is closed, or replaced by a mere buffer
-        return Console(stderr=True, emoji=False)
+        return SafeConsole(stderr=True, emoji=False)
 
 
 class _SurvivingText(io.TextIOWrapper):
