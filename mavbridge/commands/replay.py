@@ -124,7 +124,8 @@ def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
     """Return the request, without the flight's own policy if that was named again.
 
     Raises:
-        UserError: the recording names a policy that contains code, or weights that are not a file.
+        UserError: the recording names a policy that contains code, a server, or weights that are
+            not a file.
     """
     flown = source.config.policy
     if (asked.policy, asked.checkpoint, asked.contract) == (
@@ -134,7 +135,10 @@ def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
     if asked.policy is not None or asked.source == "chunks":
         return asked
     files = {"checkpoint": flown.checkpoint, "contract": flown.contract}
-    if (what := foreign_policy(flown.policy)) is not None:
+    what = foreign_policy(flown.policy)
+    if flown.policy.startswith(("ws:", "wss:")):  # also one on this computer: it would get the key
+        what = "a policy server"
+    if what is not None:
         given = [f"--{name} {path}" for name, path in files.items() if path is not None]
         raise UserError(
             f"{source.folder} says that it was flown by {flown.policy}, {what}, which a recording "

@@ -56,7 +56,8 @@ def listener() -> Iterator[socket.socket]:
         ("evil:Evil", "a program in Python"),
         ("os:system", "a program in Python"),
         ("torchscript:evil.pt", "TorchScript"),
-        ("wss://evil.example:443", "a server"),
+        ("wss://evil.example:443", "a policy server"),
+        ("ws://127.0.0.1:1", "a policy server"),
         ("", "a program in Python"),
     ],
 )
