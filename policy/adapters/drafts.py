@@ -36,6 +36,7 @@ from policy.errors import CheckpointError
 Table = Literal["contract", "state", "action", "images", "task"]
 TRAIN_CONFIG_FILE = "train_config.json"
 _WIDTH = 96
+_MAX_STATE = 1000
 _SPELLINGS: Mapping[str, Sequence[str]] = {
     "vx_mps": ("vx", "vel_x", "velocity_x"),
     "vy_mps": ("vy", "vel_y", "velocity_y"),
@@ -306,6 +307,8 @@ def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[En
     """Draft the state's names: known, guessed from their spelling, or asked for."""
     if dim == 0:
         return []
+    if not 1 <= dim <= _MAX_STATE:
+        raise CheckpointError(f"{where}: a state must have 1 to {_MAX_STATE} numbers, got {dim}")
     known = (*STATE_NAMES, *DERIVED_NAMES)
     guesses = {other: name for name, others in _SPELLINGS.items() for other in others}
     given = list(names) if names is not None and len(names) == dim else [""] * dim

@@ -164,6 +164,7 @@ def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
         (lambda folder: checkpoint(folder, action_dim=6), "its action has 6 numbers, but 4 fly"),
         (lambda folder: write_json(folder / "config.json", {}), "input_features must be"),
         (lambda folder: write_json(folder / "config.json", []), "not a JSON object"),
+        (lambda folder: dataset(folder, None, state_dim=10**30), "must have 1 to 1000 numbers"),
         (
             lambda folder: (checkpoint(folder) / "mavbridge.toml").write_text("mine"),
             "is there already",
