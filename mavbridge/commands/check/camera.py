@@ -85,12 +85,16 @@ def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock
             watched.append((need, view, Worker(name, partial(_watch, camera, view, clock))))
         for _, _, worker in watched:
             worker.start()
-        for need, view, worker in watched:
-            worker.ends_within(MEASURE_S + _JOIN_S)
-            try:
-                worker.join(_JOIN_S)
-            except HungError as error:
-                view.failure = f"the camera hangs: {error}"
+        try:
+            for _, _, worker in watched:
+                worker.ends_within(MEASURE_S + _JOIN_S)
+        finally:  # also at Ctrl-C: no camera is closed while it is read
+            for _, view, worker in watched:
+                try:
+                    worker.join(_JOIN_S)
+                except HungError as error:
+                    view.failure = f"the camera hangs: {error}"
+        for need, view, _ in watched:
             rows += judge(need, view, latency_ms=config.camera_latency)
     return rows
 
