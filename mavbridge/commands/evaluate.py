@@ -21,6 +21,7 @@ from mavbridge.config.episodes import (
     EvaluateConfig,
     WorkersConfig,
 )
+from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -90,8 +91,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         stall_ns=round(config.stalls * NS_PER_MS),
     )
     settings = SimulationSettings(
-        rates=config.rates,
-        limits=config.limits,
+        config=FlyConfig(rates=config.rates, limits=config.limits),
         delays=delays,
         draw_images=not is_scripted(config.policy),
     )

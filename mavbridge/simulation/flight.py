@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
-from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates
+from mavbridge.config.flight import FlyConfig
+from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
@@ -53,13 +53,9 @@ END_NS = 3 * NS_PER_S
 class SimulationSettings:
     """Settings of the bridge, and the delays of the world around it."""
 
-    rates: Rates = field(default_factory=Rates)
-    limits: Limits = field(default_factory=Limits)
+    config: FlyConfig = field(default_factory=FlyConfig)
+    """Flags of the flight, which always arms."""
     delays: Delays = field(default_factory=Delays)
-    raw_sticks: bool = False
-    """Send the policy's sticks without mapping them through the vehicle's curves."""
-    goal: str | None = None
-    """Value of ``--goal``."""
     draw_images: bool = True
     """False: images stay black, for policies and sinks that use none."""
     least_camera_px: int = SIM_CAMERA_PX
@@ -177,13 +173,7 @@ class SimulatedFlight:
     def _compose(self, runner: PolicyRunner, sinks: tuple[TickSink, ...]) -> GuardLoop:
         """Build the bridge on the stepped clock; its parts run as events from now on."""
         world, hop = self.clock, self._settings.delays.hop
-        config = FlyConfig(
-            link=LinkConfig(connect="lockstep", raw_sticks=self._settings.raw_sticks),
-            rates=self._settings.rates,
-            limits=self._settings.limits,
-            goal=self._settings.goal,
-            arm=True,
-        )
+        config = replace(self._settings.config, arm=True)
         plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
         loops = plan.loops
         stalled_ns = self._stalls.end_ns

@@ -3,6 +3,7 @@
 import pytest
 
 from mavbridge.commands.identify import ResponseRecording, doublet_policy, identify_pushes
+from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
@@ -11,7 +12,8 @@ from policy.motion.controllers import doublet_length_s
 
 def test_the_parameters_of_a_vehicle_are_found_in_flight() -> None:
     """ANGLE_MAX 15 deg, PILOT_Y_RATE 101 deg/s, 1.25 m/s up and down: half of the defaults."""
-    settings = SimulationSettings(draw_images=False, raw_sticks=True)
+    config = FlyConfig(link=LinkConfig(raw_sticks=True))
+    settings = SimulationSettings(config=config, draw_images=False)
     vehicle = make_vehicle(autopilot="ardupilot", gains=0.5)
     flight = SimulatedFlight(course_seed=3, seed=0, settings=settings, vehicle=vehicle)
     contract, recording = Contract(), ResponseRecording()

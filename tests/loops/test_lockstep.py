@@ -9,6 +9,7 @@ import pytest
 
 from helpers.fakes import ListSink
 from helpers.pilots import single_rate, steady
+from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -184,10 +185,10 @@ def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
 def test_the_sticks_keep_their_rate_whatever_the_rate_of_the_policy(
     stick_hz: float, action_hz: float
 ) -> None:
-    rates = Rates(stick_rate=stick_hz, action_rate=action_hz)
+    config = FlyConfig(rates=Rates(stick_rate=stick_hz, action_rate=action_hz))
     sink, pilot = ListSink(), steady(lambda: CLIMB)
     pilot = replace(pilot, contract=replace(pilot.contract, play_s=0.2))
-    flight(replace(BLIND, delays=FIXED, rates=rates)).fly(pilot, max_time_s=1.0, sinks=(sink,))
+    flight(replace(BLIND, delays=FIXED, config=config)).fly(pilot, max_time_s=1.0, sinks=(sink,))
     ticks = flown(sink)
     assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) <= 1.5 * NS_PER_S / stick_hz
     assert {tick.missed_slots for tick in ticks} == {0}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
+from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
@@ -139,7 +140,7 @@ def test_goal_height_and_altitude_are_those_of_the_vehicle(autopilot: Any, actio
     one = SimulatedFlight(
         course_seed=3,
         seed=0,
-        settings=SimulationSettings(goal="3,-2,-4", draw_images=False),
+        settings=SimulationSettings(config=FlyConfig(goal="3,-2,-4"), draw_images=False),
         vehicle=make_vehicle(autopilot=autopilot),
     )
     contract = Contract(
@@ -166,7 +167,8 @@ def test_goal_height_and_altitude_are_those_of_the_vehicle(autopilot: Any, actio
 
 def test_a_slow_policy_gets_the_states_between_its_solves() -> None:
     """It solves twice a second; the past state is 0.1 s old, not as old as the last solve."""
-    settings = SimulationSettings(rates=Rates(action_rate=2.0), draw_images=False)
+    config = FlyConfig(rates=Rates(action_rate=2.0))
+    settings = SimulationSettings(config=config, draw_images=False)
     one = SimulatedFlight(course_seed=3, seed=0, settings=settings)
     contract = replace(
         TWO_EYES,

@@ -129,7 +129,7 @@ def flown_and_repeated(
 
     monkeypatch.setattr(simulation, "build_bridge", recorded)
     monkeypatch.setattr(simulation, "MavlinkLink", partial(MavlinkLink, keeps_packets=True))
-    settings = SimulationSettings(goal=goal, least_camera_px=32)
+    settings = SimulationSettings(config=FlyConfig(goal=goal), least_camera_px=32)
     vehicle = make_vehicle(autopilot=autopilot)
     one = SimulatedFlight(course_seed=3, seed=1, settings=settings, vehicle=vehicle)
     runner = make()
