@@ -6,7 +6,7 @@ import os
 import select
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TextIO, cast
 
@@ -145,6 +145,11 @@ class _Lines(io.TextIOBase):
             self._show(line)
         return len(text)
 
+    def close(self) -> None:
+        """Pass on an unfinished last line."""
+        self.write("\n")
+        super().close()
+
 
 @contextmanager
 def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
@@ -155,10 +160,11 @@ def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
     """
     old_out, old_err = sys.stdout, sys.stderr
     is_console = old_out is not None and not old_out.closed and old_out.isatty()
-    sys.stderr = _Lines(show, old_err)
-    if is_console:
-        sys.stdout = _Lines(show, old_out)
-    try:
-        yield
-    finally:
-        sys.stdout, sys.stderr = old_out, old_err
+    with ExitStack() as stack:
+        sys.stderr = stack.enter_context(closing(_Lines(show, old_err)))
+        if is_console:
+            sys.stdout = stack.enter_context(closing(_Lines(show, old_out)))
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = old_out, old_err

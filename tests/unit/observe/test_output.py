@@ -52,6 +52,7 @@ def test_what_anybody_prints_becomes_messages(monkeypatch: pytest.MonkeyPatch) -
         sys.stderr.write("one\ntw")
         sys.stderr.write("o\r\n" + 3000 * "x")
         print("to a file")
-    assert shown == ["one", "two", 3000 * "x"]
+        sys.stderr.write("its last words")
+    assert shown == ["one", "two", 3000 * "x", "its last words"]
     assert sys.stderr is errors
     assert out.getvalue() == "to a file\n"
