@@ -1,5 +1,6 @@
 """Tables that survive a crash: Arrow IPC streams while they grow, Parquet when complete."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from policy.data.flight_data import DatasetError
 from policy.data.tables import read_rows
-from policy.files import library_name
 
 Row: TypeAlias = dict[str, object]
 """Values by column."""
@@ -34,7 +34,7 @@ class TableWriter:
         self._parquet = stem.with_suffix(".parquet")
         self._schema = schema
         self._stream.open("xb").close()
-        self._sink = pa.OSFile(str(self._stream), "wb")  # unbuffered
+        self._sink = pa.OSFile(os.fsencode(self._stream), "wb")  # unbuffered
         self._writer = pa.ipc.new_stream(self._sink, schema)
         self._waiting: list[Row] = []
         self.rows = 0
@@ -76,7 +76,7 @@ class TableWriter:
         """Join small batches: a row group each would make the file larger than the stream."""
         options: dict[str, Any] = {"compression": "zstd", "write_page_checksum": True}
         group: list[pa.RecordBatch] = []
-        with pq.ParquetWriter(library_name(path), self._schema, **options) as writer:
+        with path.open("wb") as file, pq.ParquetWriter(file, self._schema, **options) as writer:
             for batch in batches:
                 group.append(batch)
                 if sum(each.num_rows for each in group) >= _GROUP_ROWS:

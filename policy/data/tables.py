@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from policy.contract import FloatArray
 from policy.data.flight_data import DatasetError, Nanoseconds
-from policy.files import library_name
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
@@ -113,7 +112,7 @@ def _read_groups(
     """Read the undamaged row groups of a Parquet file."""
     groups, numbers, count = [], [np.zeros(0, np.int64)], 0
     failure: Exception | None = None
-    with pq.ParquetFile(library_name(path), page_checksum_verification=True) as file:
+    with path.open("rb") as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
         if file.metadata.num_rows > MAX_ROWS:
             rows = file.metadata.num_rows
             raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")

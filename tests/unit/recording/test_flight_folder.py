@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
@@ -89,6 +90,12 @@ def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:
     back = open_flight(write_recording(tmp_path / "flight", events(frames=0)))
     assert (back.ticks.num_rows, back.frames.num_rows) == (30, 0)
     assert list(back.images()) == []
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    """Libraries take a colon for an address, and cannot encode a name that is not UTF-8."""
+    back = open_flight(write_recording(tmp_path / os.fsdecode(b"10:30 \xfc"), events()))
+    assert (back.ticks.num_rows, len(list(back.images()))) == (30, 10)
 
 
 Spoil = Callable[[Path], object]
