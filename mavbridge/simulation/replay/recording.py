@@ -16,11 +16,13 @@ from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
 from mavbridge.recording.meta import FlightMeta, read_meta
 from mavbridge.recording.replay_tables import (
     PacketStamp,
+    SolveRow,
     packet_key,
     read_features,
     read_packets,
     read_solves,
 )
+from mavbridge.recording.rows import TickRow
 from mavbridge.recording.settings import read_settings
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
@@ -72,63 +74,66 @@ def open_source(folder: Path) -> ReplaySource:
     Raises:
         MavbridgeError: not a recorded flight, or one that cannot be replayed.
     """
-    meta = read_meta(folder)
-    settings = read_settings(folder)
+    meta, settings = read_meta(folder), read_settings(folder)
     if meta.contract is None:
         raise UserError(f"{folder} was flown without a policy: there is nothing to replay")
-    config = settings.config
-    config = replace(
-        config,
-        link=replace(config.link, set=()),
-        policy=replace(config.policy, dual_rate=meta.mode == "dual"),
-        record=None,
-    )
+    flown = settings.config
     damage: list[str] = []
-    table = read_table(folder / TICKS, rows.TICKS, damage=damage)
-    ticks = list(rows.read_ticks(table, meta.contract.action))
-    solved = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
-    solve_rows = list(read_solves(solved, meta.contract))
-    if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
-        solve_rows = [row for row in solve_rows if row.solve.started_ns <= ticks[-1].tick.sent_ns]
-    if not ticks or not solve_rows:
-        raise UserError(
-            f"{folder} ended before its policy had computed anything: nothing to replay"
-        )
+    ticks, solves = _rows(folder, meta, meta.contract, damage)
     stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
-    offset_ns, system = settings.wall_offset_ns, config.link.source_system
     log, skipped = read_tlog(folder / TLOG)
     if skipped:
         damage.append(
             f"{folder / TLOG} is damaged, or of another MAVLink dialect: {skipped} bytes were "
             "skipped"
         )
+    system = flown.link.source_system
     received = [each for each in log if each[1].source.system != system]
-    asked = [packet for _, packet in log if packet.source.system == system]
-    packets = tuple(_packets(received, stamps, offset_ns))
+    packets = tuple(_packets(received, stamps, settings.wall_offset_ns))
     features = _features(folder, meta, damage)
+    lost = _lost(
+        ticks=sum(row.dropped_before for row in ticks),
+        solves=sum(row.dropped_before for row in solves),
+        packets=len(stamps) - sum(packet.happened_ns is not None for packet in packets),
+    )
     return ReplaySource(
         folder=folder,
         meta=meta,
         contract=meta.contract,
-        config=config,
+        config=replace(
+            flown,
+            link=replace(flown.link, set=()),
+            policy=replace(flown.policy, dual_rate=meta.mode == "dual"),
+            record=None,
+        ),
         ticks=tuple(row.tick for row in ticks),
-        solves=tuple(row.solve for row in solve_rows),
+        solves=tuple(row.solve for row in solves),
         features=features,
         packets=packets,
         known_params=frozenset(
             packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
-            for packet in asked
-            if packet.message_id == _PARAM_REQUEST_READ
+            for _, packet in log
+            if packet.source.system == system and packet.message_id == _PARAM_REQUEST_READ
         ),
-        gaps=(
-            *damage,
-            *_lost(
-                ticks=sum(row.dropped_before for row in ticks),
-                solves=sum(row.dropped_before for row in solve_rows),
-                packets=len(stamps) - sum(p.happened_ns is not None for p in packets),
-            ),
-        ),
+        gaps=(*damage, *lost),
     )
+
+
+def _rows(
+    folder: Path, meta: FlightMeta, contract: Contract, damage: list[str]
+) -> tuple[list[TickRow], list[SolveRow]]:
+    """Read ticks and solves; raise UserError if there are none."""
+    table = read_table(folder / TICKS, rows.TICKS, damage=damage)
+    ticks = list(rows.read_ticks(table, contract.action))
+    table = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
+    solves = list(read_solves(table, contract))
+    if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
+        solves = [row for row in solves if row.solve.started_ns <= ticks[-1].tick.sent_ns]
+    if not ticks or not solves:
+        raise UserError(
+            f"{folder} ended before its policy had computed anything: nothing to replay"
+        )
+    return ticks, solves
 
 
 def _lost(**counts: int) -> Iterator[str]:
