@@ -16,8 +16,6 @@ TLOG = "link.tlog"
 SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
 """Stems of the tables for a replay."""
 SETTINGS = "settings.json"
-
-
 EXTRA = ("av", "pyarrow")
 """Packages of the ``record`` extra; each has the same name for import and installation."""
 

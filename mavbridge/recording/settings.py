@@ -6,16 +6,12 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.provenance import without_secrets
 from mavbridge.recording.folder import SETTINGS
+from mavbridge.recording.meta import FlightError
 from policy.files import read_json
 
 _T = TypeVar("_T")
-
-
-class SettingsError(MavbridgeError):
-    """The settings of a recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +30,16 @@ def write_settings(folder: Path, settings: ReplaySettings) -> None:
 
 
 def read_settings(folder: Path) -> ReplaySettings:
-    """Read the file; raise SettingsError if it is missing or not of this version."""
+    """Read the file; raise FlightError if it is missing or not of this version."""
     try:
         return _made(ReplaySettings, read_json(folder / SETTINGS))
     except FileNotFoundError as error:
-        raise SettingsError(
+        raise FlightError(
             f"{folder} has no {SETTINGS}: it was recorded by an older mavbridge, or is no flight "
             "of mavbridge fly --record; such a flight cannot be replayed"
         ) from error
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise SettingsError(
+        raise FlightError(
             f"{folder / SETTINGS} is damaged, or of another version: {error}"
         ) from error
 

@@ -20,8 +20,6 @@ from sitl.vehicle.rotation import Vec3
 
 READY_NS = 30 * NS_PER_S
 """Limit from the start to the policy's first action, which comes after some 4 s."""
-
-
 RUN_OUT_S = RUN_OUT_NS / NS_PER_S
 """Time from the last gate to the end, as in a flight in real time."""
 STOPPED_MPS = 0.3
@@ -128,8 +126,8 @@ class Referee:
         vehicle: SimulatedVehicle,
         *,
         max_time_s: float,
-        run_out_s: float = RUN_OUT_S,
-        stops: bool = False,
+        run_out_s: float,
+        stops: bool,
         should_stop: Callable[[], bool] | None,
     ) -> None:
         self._clock = clock

@@ -82,8 +82,6 @@ def make_meta(**changes: Any) -> FlightMeta:
 class InProcessWriter:
     """Replaces ``VideoWriter`` where its process is not under test: starting it takes a second."""
 
-    pid = None
-
     def __init__(self, job: VideoJob, *, pressure: str) -> None:
         if job.tlog is not None:
             job.tlog.records.close()

@@ -210,11 +210,6 @@ class VideoWriter:
             self._process.kill()
             self._process.join(END_S)
 
-    @property
-    def pid(self) -> int | None:
-        """Process id of the writer."""
-        return self._process.pid
-
 
 def start_process(
     job: VideoJob, niceness: int

@@ -17,13 +17,9 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import replay_tables
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import SETTINGS
+from mavbridge.recording.meta import FlightError
 from mavbridge.recording.replay_tables import packet_key, read_features, read_packets, read_solves
-from mavbridge.recording.settings import (
-    ReplaySettings,
-    SettingsError,
-    read_settings,
-    write_settings,
-)
+from mavbridge.recording.settings import ReplaySettings, read_settings, write_settings
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 
@@ -145,8 +141,8 @@ def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Pat
         '{"wall_offset_ns": 1, "config": {"link": {"output": "flags"}}}',
     ):
         (tmp_path / SETTINGS).write_text(damaged)
-        with pytest.raises(SettingsError, match="damaged"):
+        with pytest.raises(FlightError, match="damaged"):
             read_settings(tmp_path)
     (tmp_path / SETTINGS).unlink()
-    with pytest.raises(SettingsError, match="older mavbridge"):
+    with pytest.raises(FlightError, match="older mavbridge"):
         read_settings(tmp_path)

@@ -76,7 +76,7 @@ def test_a_pipe_that_does_not_end_or_cannot_be_written_is_left(
 def test_a_log_that_cannot_be_written_is_the_writers_failure(
     video: VideoWriter, link: PacketPipe
 ) -> None:
-    resource.prlimit(video.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
+    resource.prlimit(video._process.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
     send(link, 1_000)
     with pytest.raises(WriterError, match=r"the log of the link cannot be written: .*File too"):
         video._wait_until(lambda: False)
@@ -89,7 +89,7 @@ def test_the_log_goes_on_after_the_recording_was_finished(
     for k in range(5):
         video.submit(picture(k), make_row(k))
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
-        os.kill(video.pid, number)
+        os.kill(video._process.pid, number)
     video.finish()
     assert count_frames(tmp_path / "camera.mp4") == 5
     assert video._process.is_alive()

@@ -61,7 +61,7 @@ def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
     with writer(tmp_path, "offline") as video:
         video.submit(picture(0), make_row(0))
-        send_signal(video.pid, signal.SIGSTOP)
+        send_signal(video._process.pid, signal.SIGSTOP)
         reasons: list[str] = []
         has_begun = threading.Event()
 
@@ -76,7 +76,7 @@ def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> No
         producer = threading.Thread(target=produce)
         producer.start()
         assert has_begun.wait(DEADLINE_S)
-        send_signal(video.pid, signal.SIGKILL)
+        send_signal(video._process.pid, signal.SIGKILL)
         producer.join(DEADLINE_S)
         assert len(reasons) == 1
         assert "has died" in reasons[0]

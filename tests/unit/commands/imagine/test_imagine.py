@@ -102,7 +102,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
 
     def start(*arguments: object, **named: object) -> object:
         made = start_output(*arguments, **named)  # type: ignore[arg-type]
-        os.kill(made.video.pid, signal.SIGKILL)  # type: ignore[union-attr, arg-type]
+        os.kill(made.video._process.pid, signal.SIGKILL)  # type: ignore[union-attr, arg-type]
         return made
 
     monkeypatch.setattr(run, "StreamedOutput", start)

@@ -64,7 +64,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
     out = tmp_path / "a.mp4"
     with output(out) as made:
         made.put(make_segment(0))
-        send_signal(made.video.pid, signal.SIGSTOP)
+        send_signal(made.video._process.pid, signal.SIGSTOP)
         put: list[int] = []
         is_full = threading.Event()
 
@@ -80,7 +80,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
         assert is_full.wait(DEADLINE_S)
         # the ring of 32 frames, the segment in the thread's hands, the queue, the one being put
         assert len(put) <= 2 + 1 + QUEUED_SEGMENTS + 1
-        send_signal(made.video.pid, signal.SIGCONT)
+        send_signal(made.video._process.pid, signal.SIGCONT)
         producer.join(DEADLINE_S)
         assert len(put) == 19
         made.finish()
