@@ -8,23 +8,15 @@ from pathlib import Path
 import pytest
 
 from faults.props import FrameFeed
-from helpers.status import status_of
+from helpers.status import told_by
 from mavbridge.core.processes import free_port
 from sitl.clock import Clock
 
 pytestmark = pytest.mark.system
 
 
-def run(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    """Exit status and all output, on one line."""
-    status, captured = status_of(*flags), capsys.readouterr()
-    text = " ".join((captured.out + captured.err).replace("│", " ").split())
-    assert "Traceback" not in text
-    return status, text
-
-
-def test_help_of_fly_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
-    status, text = run(capsys, "fly", "--help")
+def test_help_of_fly_names_every_flag_of_the_contract() -> None:
+    status, text = told_by("fly", "--help")
     assert status == 0
     flags = """--connect --policy --checkpoint --dual-rate --num-diffusion-steps --camera --device
         --output --readonly --mode --arm --duration --rerun --report --record --config --set-config
@@ -43,8 +35,6 @@ BLIND = "--policy scripted --camera none"
         ("", "--connect"),
         (f"{FLY} --fly-high", "Unknown option: --fly-high"),
         (f"{FLY} --set-config rates.action=fast", "[rates][action]"),
-        (f"{FLY} --set-config rates.action=0", "between 0.5 and 500 Hz"),
-        (f"{FLY} --num-diffusion-steps 0", "between 1 and 100"),
         (f"{FLY} --readonly --arm", "--readonly sends nothing"),
         (f"{FLY} --set RC_OVERRIDE_TIME", "use NAME=VALUE"),
         (f"{FLY} --set-config link.accept_risk=all", "endless-override"),
@@ -63,9 +53,7 @@ BLIND = "--policy scripted --camera none"
         (f"{FLY} --policy scripted --record tests", "is not empty"),
         (f"{FLY} --policy scripted --record Makefile", "cannot be written"),
         (f"{FLY} --mode", "--mode requires an argument"),
-        (f"{FLY} --duration -5", "between 0.1 and 86400"),
         (f"fly now {FLY}", "unexpected word 'now'"),
-        (f"identify {FLY} --readonly", "--readonly"),
         (f"identify {FLY} --policy tog", "tog"),
         (f"identify {FLY} --json /proc/none/x.json", "--json"),
         ("identify --arm", "--connect"),
@@ -75,29 +63,25 @@ BLIND = "--policy scripted --camera none"
         ("--connect bluetooth --policy scripted --camera shm:unused", "HOST:PORT"),
     ],
 )
-def test_a_bad_flag_is_one_clear_error(
-    flags: str, told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    status, text = run(capsys, *flags.split())
+def test_a_bad_flag_is_one_clear_error(flags: str, told: str) -> None:
+    status, text = told_by(*flags.split())
     assert status == 2
     assert told in text
 
 
-def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(tmp_path: Path) -> None:
     folder, report = tmp_path / "flight", tmp_path / "report.json"
     flags = ("--connect", "bluetooth", "--record", str(folder), "--report", str(report))
-    status, text = run(capsys, *flags)
+    status, text = told_by(*flags)
     assert status == 2
     assert "HOST:PORT" in text
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_corrupt_checkpoint_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_corrupt_checkpoint_is_named(tmp_path: Path) -> None:
     path = tmp_path / "weights.safetensors"
     path.write_bytes(b"these are no weights")
-    status, text = run(capsys, "--connect", "udp:127.0.0.1:1", "--checkpoint", str(path))
+    status, text = told_by("--connect", "udp:127.0.0.1:1", "--checkpoint", str(path))
     assert status == 2
     assert "weights.safetensors" in text
 
@@ -124,47 +108,43 @@ def camera() -> Iterator[str]:
         yield f"shm:{name}"
 
 
-def test_a_port_in_use(camera: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_in_use(camera: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         connect = f"udp:127.0.0.1:{other.getsockname()[1]}"
-        status, text = run(capsys, "--connect", connect, "--policy", "scripted", "--camera", camera)
+        status, text = told_by("--connect", connect, "--policy", "scripted", "--camera", camera)
     assert status == 2
     assert "Address already in use" in text
     assert "stop the program that has it" in text
     assert "ms" not in text.split()  # no table of a flight that never was
 
 
-def test_tcp_that_is_refused_is_told_before_the_policy_is_loaded(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_tcp_that_is_refused_is_told_before_the_policy_is_loaded() -> None:
     connect = f"tcp:127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     flags = ("--policy", "scripted", "--camera", "none")
-    status, text = run(capsys, "--connect", connect, *flags)
+    status, text = told_by("--connect", connect, *flags)
     assert status == 3
     assert text.count("nobody listens there") == 1
     assert "scripted" not in text  # what a loaded policy says of itself
 
 
-def test_a_viewer_and_a_camera_that_are_not_there_are_told_before_the_policy_is_loaded(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_viewer_and_a_camera_that_are_not_there_are_told_before_the_policy_is_loaded() -> None:
     url = f"rerun+http://127.0.0.1:{free_port(socket.SOCK_STREAM)}/proxy"
     flags = ("--connect", f"udp:127.0.0.1:{free_port()}", "--policy", "scripted")
-    status, text = run(capsys, *flags, "--camera", "none", "--rerun", f"connect={url}")
+    status, text = told_by(*flags, "--camera", "none", "--rerun", f"connect={url}")
     assert (status, "scripted" in text) == (3, False)
     assert "no Rerun viewer listens" in text
-    status, text = run(capsys, *flags, "--camera", "/dev/video999")
+    status, text = told_by(*flags, "--camera", "/dev/video999")
     assert (status, "scripted:" in text) == (3, False)
     assert "camera /dev/video999 is not there" in text
 
 
-def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_heartbeat(camera: str, tmp_path: Path) -> None:
     report = tmp_path / "report.json"
     flags = ("--policy", "scripted", "--camera", camera, "--set-config", "link.timeout=0.2")
     kept = ("--record", str(tmp_path / "flights" / "1"), "--rerun", str(tmp_path / "flight.rrd"))
     connect = f"udp:127.0.0.1:{free_port()}"
-    status, text = run(capsys, "--connect", connect, *flags, *kept, "--report", str(report))
+    status, text = told_by("--connect", connect, *flags, *kept, "--report", str(report))
     assert status == 3
     assert "heard nothing" in text
     assert list(tmp_path.iterdir()) == []
@@ -172,13 +152,13 @@ def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture
     folder.mkdir()
     viewed.write_text("an older flight")
     kept = ("--record", str(folder), "--rerun", str(viewed))
-    assert run(capsys, "--connect", connect, *flags, *kept)[0] == 3
+    assert told_by("--connect", connect, *flags, *kept)[0] == 3
     assert (list(folder.iterdir()), viewed.read_text()) == ([], "an older flight")
 
 
-def test_a_camera_that_ends(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_ends(video: Path) -> None:
     connect = f"udp:127.0.0.1:{free_port()}"
     flags = ("--connect", connect, "--policy", "scripted", "--camera", str(video))
-    status, text = run(capsys, *flags)
+    status, text = told_by(*flags)
     assert status == 3
     assert "ended after 15 frames" in text
