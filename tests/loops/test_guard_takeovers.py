@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from helpers.guard_flights import GuardFlight, climbing_first, hovering
+from helpers.guard_flights import GuardFlight, climbing_first
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.values import Phase
@@ -21,39 +21,29 @@ def by_mode(flight: GuardFlight) -> None:
     flight.pilot_mode(Mode.LOITER)
 
 
-def by_radio(flight: GuardFlight) -> None:
-    flight.receiver(ch5=1680)  # FLTMODE5: LOITER
-
-
 def by_switch(flight: GuardFlight) -> None:
     flight.receiver(ch8=1000)
 
 
-def by_joystick(flight: GuardFlight) -> None:
-    flight.joystick(50, (1700, 1500, 1500, 1500))
+def by_joystick(rate_hz: float) -> Callable[[GuardFlight], None]:
+    """At 10 Hz within three packets: each is shown for a third of a send period only."""
+    return lambda flight: flight.joystick(rate_hz, (1700, 1450, 1600, 1500))
 
 
-TAKEOVERS = [
-    (by_mode, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.03),
-    (by_radio, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.25),
-    (by_switch, because(Code.OVERRIDE_SWITCH_OFF), 0.12),
-    (
-        by_joystick,
-        because(
-            Code.OVERRULED,
-            quantity="sticks",
-            output="rc-override",
-            fault="foreign",
-        ),
-        0.5,
-    ),
-]
+OVERRULED = because(Code.OVERRULED, quantity="sticks", output="rc-override", fault="foreign")
 
 
-@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
+@pytest.mark.parametrize(
+    ("take", "reason", "within_s"),
+    [
+        (by_switch, because(Code.OVERRIDE_SWITCH_OFF), 0.12),
+        *((by_joystick(rate_hz), OVERRULED, 0.5) for rate_hz in (10, 50, 200)),
+    ],
+)
 def test_a_takeover_releases_and_no_mode_command_ever_leaves(
     take: Callable[[GuardFlight], None], reason: Reason, within_s: float
 ) -> None:
+    """By a mode, of the pilot's radio or of a ground station, in test_output_releases.py."""
     flight = GuardFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
     before_ns = flight.clock.now_ns()
     take(flight)
@@ -67,18 +57,6 @@ def test_a_takeover_releases_and_no_mode_command_ever_leaves(
     releases = flight.overrides(given_ns - MS)
     assert releases
     assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
-
-
-@pytest.mark.parametrize("rate_hz", [10, 50, 200])
-def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(rate_hz: float) -> None:
-    """At 10 Hz within three of its packets: each is shown for a third of a send period only."""
-    flight = GuardFlight(hovering).fly()
-    flight.joystick(rate_hz, (1700, 1450, 1600, 1500))
-    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
-
-    assert took_s < 0.5, took_s
-    assert Code.OVERRULED in flight.codes
-    assert not flight.modes_asked()
 
 
 def by_parameter(flight: GuardFlight) -> None:
