@@ -15,36 +15,29 @@ from mavbridge.core.errors import CameraError
 
 
 @pytest.mark.parametrize(
-    ("stamp_ms", "is_our_clock", "captured_ms"),
+    ("stamp_ms", "is_our_clock", "latency_ms", "captured_ms"),
     [
-        pytest.param(1_000_000.0, False, 1_000_000, id="now"),
-        pytest.param(999_000.0, False, 999_000, id="as old as it may be"),
-        pytest.param(998_999.0, False, 1_000_000, id="too old"),
-        pytest.param(1_000_000.1, False, 1_000_000, id="from the future"),
-        pytest.param(-1.0, False, 1_000_000, id="not supported"),
-        pytest.param(1.7e12, False, 1_000_000, id="wall clock"),
-        pytest.param(997_000.0, True, 997_000, id="from a queue that nobody read"),
-        pytest.param(1_000_400.0, True, 1_000_400, id="our clock, ahead"),
-        pytest.param(0.0, True, 1_000_000, id="our clock, no stamp"),
+        pytest.param(1_000_000.0, False, 0, 1_000_000, id="now"),
+        pytest.param(999_000.0, False, 0, 999_000, id="as old as it may be"),
+        pytest.param(998_999.0, False, 0, 1_000_000, id="too old"),
+        pytest.param(1_000_000.1, False, 0, 1_000_000, id="from the future"),
+        pytest.param(-1.0, False, 0, 1_000_000, id="not supported"),
+        pytest.param(1.7e12, False, 0, 1_000_000, id="wall clock"),
+        pytest.param(997_000.0, True, 0, 997_000, id="from a queue that nobody read"),
+        pytest.param(1_000_400.0, True, 0, 1_000_400, id="our clock, ahead"),
+        pytest.param(0.0, True, 0, 1_000_000, id="our clock, no stamp"),
+        # No stamp makes a frame younger than the latency.
+        pytest.param(999_990.0, True, 20, 999_980, id="of the transfer"),
+        pytest.param(999_900.0, True, 20, 999_900, id="of the exposure"),
+        pytest.param(1_000_400.0, True, 20, 1_000_400, id="ahead"),
+        pytest.param(0.0, True, 20, 999_980, id="no stamp"),
+        pytest.param(-1.0, False, 20, 999_980, id="not supported, a latency"),
     ],
 )
-def test_the_drivers_stamp_is_taken_if_it_can_be_one(stamp_ms, is_our_clock, captured_ms):
-    stamps = ExposureClock(is_our_clock)
-    assert stamps.exposure_ns(round(stamp_ms * NS_PER_MS), START_NS) == captured_ms * NS_PER_MS
-
-
-@pytest.mark.parametrize(
-    ("stamp_ms", "is_our_clock", "captured_ms"),
-    [
-        pytest.param(999_990.0, True, 999_980, id="of the transfer"),
-        pytest.param(999_900.0, True, 999_900, id="of the exposure"),
-        pytest.param(1_000_400.0, True, 1_000_400, id="ahead"),
-        pytest.param(0.0, True, 999_980, id="no stamp"),
-        pytest.param(-1.0, False, 999_980, id="not supported"),
-    ],
-)
-def test_no_stamp_makes_a_frame_younger_than_the_latency(stamp_ms, is_our_clock, captured_ms):
-    stamps = ExposureClock(is_our_clock, latency_ns=20 * NS_PER_MS)
+def test_the_drivers_stamp_is_taken_if_it_can_be_one(
+    stamp_ms, is_our_clock, latency_ms, captured_ms
+):
+    stamps = ExposureClock(is_our_clock, latency_ns=latency_ms * NS_PER_MS)
     assert stamps.exposure_ns(round(stamp_ms * NS_PER_MS), START_NS) == captured_ms * NS_PER_MS
 
 

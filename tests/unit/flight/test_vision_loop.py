@@ -53,61 +53,36 @@ def make_loop(clock, camera, *, cache=None, sink=None, lock=None, **changes):
     )
 
 
-def faults(picture, image_watch, airborne_from_s, seconds=4):
-    """Time of the first fault after the start, and the codes of all features from then on."""
-    clock, cache, sink = FakeClock(), FeatureCache(), ListSink()
-    loop = make_loop(
-        clock,
-        StillCamera(clock, picture),
-        cache=cache,
-        sink=sink,
-        image_watch=image_watch,
-        is_airborne=lambda: clock.now_ns() >= START_NS + airborne_from_s * NS_PER_S,
-    )
-    seen = []
-    while clock.now_ns() < START_NS + seconds * NS_PER_S:
-        loop.step()
-        feature = cache.latest()
-        seen.append(((feature.captured_ns - START_NS) / NS_PER_S, feature.fault))
-    assert len(sink.visions) == len(seen)
-    first_s = next((at_s for at_s, fault in seen if fault is not None), None)
-    if first_s is None:
-        return None, None
-    (code,) = {None if fault is None else fault.code for at_s, fault in seen if at_s >= first_s}
-    return first_s, code
-
-
 SCENE = np.random.default_rng(3).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+FRAME_S = FRAME_NS / NS_PER_S
 
 
 def watch():
     return ImageWatch(max_frozen_s=0.5, max_black_s=0.5)
 
 
-FRAME_S = FRAME_NS / NS_PER_S
-BLACK, NEVER_S = np.zeros_like(SCENE), 100
-TAKEN_OFF_S = 1 + TAKEOFF_NS / NS_PER_S
-
-
-@pytest.mark.parametrize(
-    ("picture", "airborne_from_s", "code", "at_s"),
-    [
-        pytest.param(SCENE, 0, Code.IMAGE_FROZEN, FRAME_S + 0.5, id="frozen"),
-        pytest.param(SCENE, NEVER_S, None, None, id="frozen on the ground"),
-        pytest.param(SCENE, 1, Code.IMAGE_FROZEN, TAKEN_OFF_S + 0.5, id="frozen since the ground"),
-        pytest.param(BLACK, NEVER_S, Code.IMAGE_BLANK, FRAME_S + 0.5, id="black on the ground"),
-    ],
-)
-def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(
-    picture, airborne_from_s, code, at_s
-):
-    first_s, found = faults(picture, watch(), airborne_from_s)
-    assert found == code
-    assert first_s == (at_s if at_s is None else pytest.approx(at_s, abs=2 * FRAME_S))
-
-
-def test_without_a_watch_nothing_is_a_fault():
-    assert faults(BLACK, None, 0) == (None, None)
+@pytest.mark.parametrize("is_watched", [True, False])
+def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(is_watched):
+    """Frozen since the ground, which it leaves after a second."""
+    clock, cache, sink = FakeClock(), FeatureCache(), ListSink()
+    loop = make_loop(
+        clock,
+        StillCamera(clock, SCENE),
+        cache=cache,
+        sink=sink,
+        image_watch=watch() if is_watched else None,
+        is_airborne=lambda: clock.now_ns() >= START_NS + NS_PER_S,
+    )
+    limit_s, seen = 1.5 + TAKEOFF_NS / NS_PER_S, []
+    while clock.now_ns() < START_NS + 4 * NS_PER_S:
+        loop.step()
+        feature = cache.latest()
+        at_s = (feature.captured_ns - START_NS) / NS_PER_S
+        if abs(at_s - limit_s) > 2 * FRAME_S:
+            seen.append((at_s > limit_s, feature.fault and feature.fault.code))
+    code = Code.IMAGE_FROZEN if is_watched else None
+    assert set(seen) == {(False, None), (True, code)}
+    assert len(sink.visions) == 4 * NS_PER_S // FRAME_NS + 1
 
 
 def test_a_camera_faster_than_the_visual_rate_is_thinned():
