@@ -4,11 +4,13 @@ import math
 import select
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count, islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from faults.link import LOOPBACK, Carrier, FaultyLink, LinkFaults
@@ -328,3 +330,11 @@ def set_fields(message: Message, **values: float) -> None:
     """Change fields of a received message, so that packing it again sends the new values."""
     for name, value in values.items():
         setattr(message, name, value if math.isnan(value) else type(getattr(message, name))(value))
+
+
+def logged_overrides(path: Path) -> Iterator[Override]:
+    """Yield the first four channels of every RC_CHANNELS_OVERRIDE in a telemetry log."""
+    log = mavutil.mavlogfile(str(path))
+    while (message := log.recv_match(type="RC_CHANNELS_OVERRIDE")) is not None:
+        yield Override(*(getattr(message, f"chan{k}_raw") for k in range(1, 5)))
+    log.f.close()

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from faults.processes import StageError, status_of
 from faults.props import Transmitter
+from faults.relay import logged_overrides
 from faults.stage import ORDERLY, Stage, faulty_policy, staged
 from faults.steps import Step, make_step
-from helpers.flight_logs import logged_overrides
 from mavbridge.core.reasons import Code, because
 from sitl.clock import NS_PER_S
 

@@ -1,5 +1,8 @@
 """MAVLink peer for tests, built on the dialect alone: packs messages and reads ours."""
 
+import socket
+
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
@@ -64,3 +67,15 @@ def sent(data: bytes) -> dialect.MAVLink_message:
     """Return the one message in a packet of ours."""
     (message,) = WireEnd().read(data)
     return message
+
+
+def _has_ipv6() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            probe.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="this computer has no IPv6 loopback")

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from faults.processes import Process
-from faults.relay import Override
+from faults.relay import Override, logged_overrides
 from faults.stage import faulty_policy, staged
-from helpers.flight_logs import logged_overrides
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 

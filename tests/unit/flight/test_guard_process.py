@@ -14,7 +14,7 @@ import pytest
 
 from helpers.factories import make_guard_tick
 from helpers.fakes import START_NS, FakeClock
-from helpers.network import needs_ipv6
+from helpers.wire import needs_ipv6
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.link_settings import LinkSettings

@@ -15,7 +15,7 @@ import pytest
 import serial
 
 from helpers.fakes import FakeClock
-from helpers.network import needs_ipv6
+from helpers.wire import needs_ipv6
 from mavbridge.core.address import spelled
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import UserError
