@@ -1,10 +1,22 @@
-"""Hostile datagrams in flights of both firmwares; `make fuzz` feeds more of them."""
+"""Hostile datagrams against codec, signatures and flights; `make fuzz` feeds more of them."""
 
 import pytest
 
+from fuzz.codec_target import fuzz_codec
 from fuzz.link_target import COMBINATIONS, HostileFlight
+from fuzz.signed_target import fuzz_signing
 from mavbridge.core.vehicle import ActionKind
 from sitl.vehicle.config import AutopilotName
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_datagrams_yield_sound_messages_or_none(seed: int) -> None:
+    fuzz_codec(seed, 16_000)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_only_packets_signed_with_the_key_are_accepted_and_each_once(seed: int) -> None:
+    fuzz_signing(seed, 10_000)
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
