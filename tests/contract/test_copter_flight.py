@@ -1,4 +1,4 @@
-"""Arming, sticks, landing and a forced reboot as measured on ArduCopter."""
+"""Arming, sticks, releases, modes that hold, and a forced reboot as measured on ArduCopter."""
 
 import math
 
@@ -6,7 +6,15 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import REBOOT_FORCE, is_armed, last, named
-from helpers.copter_companion import ACCEPTED, ALT_HOLD, FAILED, STABILIZE
+from helpers.copter_companion import (
+    ACCEPTED,
+    ALT_HOLD,
+    BRAKE,
+    FAILED,
+    LOITER,
+    POSHOLD,
+    STABILIZE,
+)
 
 REBOOT = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 
@@ -77,3 +85,40 @@ def test_a_forced_reboot_in_flight_leaves_it_disarmed_in_its_boot_mode(expendabl
     assert not is_armed(heartbeat)
     assert heartbeat.custom_mode == STABILIZE
     assert after_ms < before_ms
+
+
+# --- after a release by the bridge
+
+UNTOUCHED = (1500, 1500, 1000, 1500)
+
+
+def position(messages):
+    message = last(messages, "LOCAL_POSITION_NED")
+    return message.x, message.y, message.z
+
+
+def test_brake_stops_and_ignores_the_sticks(flying):
+    flying.hold(1.0, roll=1754)
+    assert flying.set_mode(BRAKE) == ACCEPTED
+    start = position(flying.hold(3.0, thr=1000))
+    end = position(flying.hold(2.0, roll=1900, pitch=1200, thr=1000, yaw=1700))
+    assert math.dist(start, end) < 0.5
+
+
+@pytest.mark.parametrize(("mode", "sinks"), [(ALT_HOLD, True), (LOITER, True), (BRAKE, False)])
+def test_sticks_given_to_an_idle_receiver_sink_in_the_pilots_modes(flying, mode, sinks):
+    assert flying.set_mode(mode) == ACCEPTED
+    flying.hold(1.0)
+    flying.override(*[0] * 8)
+    messages = flying.advance(2.0)
+    assert flying.channels()[:4] == UNTOUCHED
+    assert (last(messages, "LOCAL_POSITION_NED").vz > 1.5) == sinks
+
+
+@pytest.mark.parametrize("mode", [LOITER, POSHOLD])
+def test_position_modes_stop_at_centred_sticks(flying, mode):
+    flying.hold(1.0, pitch=1300)
+    assert flying.set_mode(mode) == ACCEPTED
+    start = position(flying.hold(3.7))
+    end = position(flying.hold(1.5))
+    assert math.dist(start, end) < 0.5

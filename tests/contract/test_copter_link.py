@@ -84,3 +84,10 @@ def test_all_params_come_with_their_index(companion):
     for index in missing:
         companion.send(mav.MAVLink_param_request_read_message(1, 1, b"", index))
         assert companion.wait("PARAM_VALUE").param_index == index
+
+
+def test_heartbeats_stream_at_the_requested_rate(companion):
+    assert companion.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10) == ACCEPTED
+    companion.wait("HEARTBEAT")
+    messages = companion.advance(2.0)
+    assert sum(m.get_type() == "HEARTBEAT" for m in messages) == pytest.approx(20, abs=4)
