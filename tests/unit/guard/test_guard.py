@@ -179,11 +179,16 @@ def test_what_has_not_changed_is_not_sent_between_slots() -> None:
     assert [guard.step(30 + k).decision for k in range(1, 10)] == [None] * 9
 
 
-def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
+def asked_before_the_reset() -> tuple[Stepped, GuardOutput]:
+    """An act at 30 ms, and what came of it; all chunks are of before the policy's reset."""
     guard = Stepped()
     for at_ms in (0, 10, 20):
         guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
-    asked = guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    return guard, guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+
+
+def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
+    guard, asked = asked_before_the_reset()
     assert (asked.tick.phase, asked.tick.starting_ns) == (Phase.PREPARING, START_NS + 30 * MS)
     held = guard.step(40, guard.chunk(40)._replace(reset_ns=START_NS + 30 * MS - 1))
     assert (held.tick.phase, held.decision) == (Phase.PREPARING, None)
@@ -193,10 +198,7 @@ def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> No
 
 
 def test_an_act_that_was_taken_back_leaves_no_reset_for_the_next_one() -> None:
-    guard = Stepped()
-    for at_ms in (0, 10, 20):
-        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
-    guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    guard, _ = asked_before_the_reset()
     given_up = guard.step(40, guard.chunk(40)._replace(reset_ns=0), act="release")
     assert given_up.tick.starting_ns == 0
     for at_ms in range(50, 2000, 10):
@@ -208,10 +210,7 @@ def test_an_act_that_was_taken_back_leaves_no_reset_for_the_next_one() -> None:
 
 
 def test_a_reset_that_takes_longer_than_the_grace_is_asked_for_once() -> None:
-    guard = Stepped()
-    for at_ms in (0, 10, 20):
-        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
-    guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    guard, _ = asked_before_the_reset()
     starts = {guard.step(at_ms).tick.starting_ns for at_ms in range(40, 400, 10)}
     assert starts == {START_NS + 30 * MS}
     for at_ms in range(400, 600, 10):
@@ -597,28 +596,22 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     assert guard.failure is None
 
 
-def test_body_rates_are_bridged_by_a_level_attitude() -> None:
+@pytest.mark.parametrize("tau_s", [0.0, 0.05])
+def test_body_rates_are_bridged_by_a_level_attitude_that_is_not_filtered_with_them(
+    tau_s: float,
+) -> None:
     turn = BodyRates(0.5, 1.0, 0.0, 0.0)
-    rates = Smoothing(limits=limits_of("rates"), tau_s=0.0)
-    guard = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
-    for k in range(3):
-        guard.step(10 * k, guard.chunk(10 * k, turn))
-    engaged = guard.step(30, guard.chunk(30, turn, actions=2), act="engage")
-    assert engaged.decision == Command(action=turn)
-    beyond = guard.step(70)
-    assert beyond.decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
-    assert beyond.tick.trace is not None
-    assert beyond.tick.is_coasting
-    assert guard.step(80, guard.chunk(80, turn)).decision == Command(action=turn)
-
-
-def test_the_level_attitude_that_bridges_body_rates_is_not_filtered_with_them() -> None:
-    turn = BodyRates(0.5, 1.0, 0.0, 0.0)
-    rates = Smoothing(limits=limits_of("rates"), tau_s=0.05)
+    rates = Smoothing(limits=limits_of("rates"), tau_s=tau_s)
     guard = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
     guard.engaged(sticks=turn)
     guard.step(40, guard.chunk(40, turn, actions=2))
-    assert guard.step(80).decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    beyond = guard.step(80)
+    assert beyond.decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    assert beyond.tick.trace is not None
+    assert beyond.tick.is_coasting
+    guard.step(90, guard.chunk(90, turn))
+    if tau_s == 0.0:
+        assert guard.decisions[0] == guard.decisions[-1] == Command(action=turn)
 
 
 def of_velocities(mode: str, **rules: Any) -> Stepped:
