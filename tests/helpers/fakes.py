@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from helpers.guard_facts import COPTER_MODES
+from helpers.guard_facts import AIRBORNE, COPTER_MODES
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
-    NEUTRAL,
     Action,
     ActionMeaning,
     Command,
@@ -63,17 +62,8 @@ class ListSink:
         return [event for event in self.events if isinstance(event, VisionTick)]
 
 
-AIRBORNE_STATUS = VehicleStatus(
-    mode="ALT_HOLD",
-    armed=True,
-    is_landed=False,
-    has_receiver=True,
-    pilot_sticks=NEUTRAL,
-    rc_arrived_ns=START_NS,
-    is_position_valid=True,
-    position_ned_m=(0.0, 0.0, -3.0),
-)
-"""Armed in ALT_HOLD, 3 m up, with a receiver whose sticks are centred."""
+AIRBORNE_STATUS = replace(AIRBORNE.status, rc_channels_us=(), rc_arrived_ns=START_NS)
+"""Armed in ALT_HOLD, 10 m up, with a receiver whose sticks are centred."""
 
 
 def level_telemetry(arrived_ns: int) -> Telemetry:

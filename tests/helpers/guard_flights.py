@@ -8,7 +8,7 @@ record and the sent bytes.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -223,14 +223,19 @@ class GuardFlight:
         """Return the state of both ends, for a failed test."""
         ap = self.vehicle.ap
         return (
-            f"{self.phase} ({self.reason}); {ap.mode.name}, armed {ap.armed}, "
+            f"{self.phase} ({self.reason}); {ap.mode_name}, armed {ap.armed}, "
             f"height {self.height_m:.1f} m, {self.messages}"
         )
 
     @property
+    def summary(self) -> dict[str, Any]:
+        """The vehicle's report."""
+        return self.vehicle.log.summary(self.vehicle.ap)
+
+    @property
     def t_s(self) -> float:
         """Seconds since boot: the time of the vehicle's records."""
-        return self.vehicle.log.summary(self.vehicle.ap)["duration_s"]
+        return self.summary["duration_s"]
 
     @property
     def flown_s(self) -> float:
@@ -244,23 +249,27 @@ class GuardFlight:
 
     # --- ways into the air
 
-    def launch(self, mode: Mode = Mode.ALT_HOLD) -> "GuardFlight":
+    def launch(self) -> Self:
         """Hover armed under the pilot, with the link ready and the policy fresh."""
         self.vehicle.launch(ALOFT)
-        self.ap.set_mode(mode)
+        self.ap.set_mode(Mode.ALT_HOLD)
         self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=8)
         return self
 
-    def fly(self, seconds: float = 1.5) -> "GuardFlight":
+    def fly(self, seconds: float = 1.5) -> Self:
         """Launch, engage by the key, and let the policy fly long enough for the echo."""
         self.launch()
         self.act("engage")
-        self.until(lambda: self.phase is Phase.FLYING, within_s=3.0)
+        self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
+        self._begin_program()
         self.run(seconds)
         assert self.phase is Phase.FLYING, self.describe()
         return self
 
-    def take_off(self, seconds: float = 4.0) -> "GuardFlight":
+    def _begin_program(self) -> None:
+        """Called when the policy has the sticks."""
+
+    def take_off(self, seconds: float = 4.0) -> Self:
         """Engage with --arm on the ground, and climb; also for a vehicle without a receiver."""
         self.until(lambda: self.phase is Phase.FLYING, within_s=12)
         self.run(seconds)
@@ -345,13 +354,12 @@ class GuardFlight:
 
     def record(self, since_s: float = 0.0) -> list[dict[str, Any]]:
         """The vehicle's own record of its sticks, by time since boot."""
-        entries = self.vehicle.log.summary(self.vehicle.ap)["sticks"]
-        return [entry for entry in entries if entry["t_s"] >= since_s]
+        return [entry for entry in self.summary["sticks"] if entry["t_s"] >= since_s]
 
     @property
     def modes(self) -> list[str]:
         """The vehicle's modes in order."""
-        return [entry["mode"] for entry in self.vehicle.log.summary(self.ap)["modes"]]
+        return [entry["mode"] for entry in self.summary["modes"]]
 
     # --- others
 

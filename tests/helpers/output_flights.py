@@ -5,7 +5,7 @@ The policy is a scripted one, so that every kind of action flies equal programs.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -13,7 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.guard_flights import ALOFT, GuardFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
-from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
 from policy.motion.controllers import LEG_MPS, LEG_S, Motion, Program, Push, make_program
@@ -143,7 +142,7 @@ class OutputFlight(GuardFlight):
 
     # --- into the air
 
-    def launch(self, mode: Any = None) -> "OutputFlight":
+    def launch(self) -> Self:
         """Hover armed under the pilot, with the link ready and the policy fresh."""
         self.put_in_air()
         self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=10)
@@ -164,16 +163,9 @@ class OutputFlight(GuardFlight):
         self.px4.stick_input.valid = self.px4.stick_input._never_ages = False
         self.px4.start_motors(ignores_sticks=True)
 
-    def fly(self, seconds: float = 1.5) -> "OutputFlight":
-        """Launch, engage by the key, and let the policy start its program at once."""
-        self.launch()
-        self.act("engage")
-        self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
+    def _begin_program(self) -> None:
         self.run(0.05)  # the policy is reset when a flight begins
         self.scripted.program_start_s = 0.0
-        self.run(seconds)
-        assert self.phase is Phase.FLYING, self.describe()
-        return self
 
     # --- the vehicle
 
@@ -196,17 +188,8 @@ class OutputFlight(GuardFlight):
     def position_ned_m(self) -> tuple[float, float, float]:
         return self.vehicle.ap.truth.position_ned_m
 
-    @property
-    def summary(self) -> dict[str, Any]:
-        """The vehicle's report."""
-        return self.vehicle.log.summary(self.vehicle.ap)
-
     def describe(self) -> str:
-        ap = self.vehicle.ap
-        return (
-            f"{self.autopilot} {self.kind}: {self.phase} ({self.reason}); {ap.mode_name}, armed "
-            f"{ap.armed}, height {self.height_m:.1f} m, {self.messages}"
-        )
+        return f"{self.autopilot} {self.kind}: {super().describe()}"
 
     def pilot_changes_mode(self) -> str:
         """Take over as a pilot at a ground station, in a mode that holds; return its name."""

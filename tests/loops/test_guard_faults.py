@@ -146,4 +146,4 @@ def test_over_an_idle_receiver_no_ending_lets_the_vehicle_fall(
     flight.run(10)
     assert flight.ap.mode is mode, flight.describe()
     assert mode is Mode.LAND or height_m - flight.height_m < 2.0
-    assert flight.vehicle.log.summary(flight.ap)["impact_speed_mps"] <= 1.0
+    assert flight.summary["impact_speed_mps"] <= 1.0
