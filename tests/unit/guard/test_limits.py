@@ -111,44 +111,37 @@ def test_a_slew_of_0_is_no_limit() -> None:
     assert stick_smoothing(max_slew_per_s=0.0).limits.change_per_s == (math.inf,) * 4
 
 
-def test_where_the_vehicle_has_not_said_what_it_does_a_flight_begins_level_and_at_rest() -> None:
-    silent = Telemetry()
-    attitude = first_action(ActionMeaning(kind="attitude"), silent, None)
-    assert attitude == pytest.approx((0.39, 0.0, 0.0, 0.0))
-    assert first_action(ActionMeaning(kind="velocity"), silent, None) == (0.0, 0.0, 0.0, 0.0)
-    ahead = ActionMeaning(kind="velocity", is_heading_frame=True)
-    moving = Telemetry(velocity_ned_mps=Reading(0, (1.0, 2.0, -0.5)))
-    assert first_action(ahead, moving, None) == (1.0, 2.0, -0.5, 0.0)
-
-
-def test_a_velocity_ahead_is_that_of_the_world_turned_by_the_heading() -> None:
-    turned = Telemetry(
-        ned_from_body_wxyz=Reading(0, quaternion_from_euler(0.0, 0.0, math.radians(30.0))),
-        velocity_ned_mps=Reading(0, (3.0, 2.0, -0.5)),
-    )
-    ahead = first_action(ActionMeaning(kind="velocity", is_heading_frame=True), turned, None)
-    # 3 cos 30 + 2 sin 30 to the front, 2 cos 30 - 3 sin 30 to the right
-    assert ahead == pytest.approx((3.598076, 0.232051, -0.5, 0.0), abs=1e-6)
-
-
-HALF = math.radians(45.0)
+MOVING = Telemetry(velocity_ned_mps=Reading(0, (1.0, 2.0, -0.5)))
+LEANING = Telemetry(ned_from_body_wxyz=Reading(0, (math.cos(0.1), math.sin(0.1), 0.0, 0.0)))
 TURNED = Telemetry(
-    ned_from_body_wxyz=Reading(0, (math.cos(HALF), 0.0, 0.0, math.sin(HALF))),
-    velocity_ned_mps=Reading(0, (1.0, 2.0, -0.5)),
+    ned_from_body_wxyz=Reading(0, quaternion_from_euler(0.0, 0.0, math.radians(30.0))),
+    velocity_ned_mps=Reading(0, (3.0, 2.0, -0.5)),
 )
-"""The nose points east."""
+"""The nose points 30 degrees to the east of north."""
+PILOT = Sticks(0.1, 0.2, 0.3, 0.4)
+AHEAD = ActionMeaning(kind="velocity", is_heading_frame=True)
 
 
-def test_a_flight_begins_with_what_the_vehicle_does() -> None:
-    pilot = Sticks(0.1, 0.2, 0.3, 0.4)
-    assert first_action(ActionMeaning(), TURNED, pilot) == pilot
-    assert first_action(ActionMeaning(), TURNED, None) == NEUTRAL
-    north = first_action(ActionMeaning(kind="velocity"), TURNED, None)
-    assert north == (1.0, 2.0, -0.5, 0.0)
-    assert first_action(ActionMeaning(kind="rates"), TURNED, None) == (0.39, 0.0, 0.0, 0.0)
-    lean = Telemetry(ned_from_body_wxyz=Reading(0, (math.cos(0.1), math.sin(0.1), 0.0, 0.0)))
-    attitude = first_action(ActionMeaning(kind="attitude"), lean, None)
-    assert attitude == pytest.approx((0.39, 0.2, 0.0, 0.0))
+@pytest.mark.parametrize(
+    ("meaning", "telemetry", "sticks", "first"),
+    [
+        (ActionMeaning(), TURNED, PILOT, PILOT),
+        (ActionMeaning(), TURNED, None, NEUTRAL),
+        (ActionMeaning(kind="rates"), TURNED, None, (0.39, 0.0, 0.0, 0.0)),
+        (ActionMeaning(kind="attitude"), LEANING, None, (0.39, 0.2, 0.0, 0.0)),
+        (ActionMeaning(kind="velocity"), TURNED, None, (3.0, 2.0, -0.5, 0.0)),
+        # 3 cos 30 + 2 sin 30 to the front, 2 cos 30 - 3 sin 30 to the right
+        (AHEAD, TURNED, None, (3.598076, 0.232051, -0.5, 0.0)),
+        # What the vehicle has not said: level, at rest, north.
+        (ActionMeaning(kind="attitude"), Telemetry(), None, (0.39, 0.0, 0.0, 0.0)),
+        (ActionMeaning(kind="velocity"), Telemetry(), None, (0.0, 0.0, 0.0, 0.0)),
+        (AHEAD, MOVING, None, (1.0, 2.0, -0.5, 0.0)),
+    ],
+)
+def test_a_flight_begins_with_what_the_vehicle_does(
+    meaning: ActionMeaning, telemetry: Telemetry, sticks: Sticks | None, first: tuple[float, ...]
+) -> None:
+    assert first_action(meaning, telemetry, sticks) == pytest.approx(first, abs=1e-6)
 
 
 @pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(1.54, 0.0), (3.0, -1.2), (0.1, 1.55)])
