@@ -16,6 +16,7 @@ import numpy as np
 
 from mavbridge.camera.grabber import Image, ImageSource
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.workers import Worker
 
 HEADER = Struct("<IHHIIQ")
 """From the description of the format, independent of the tested code."""
@@ -65,22 +66,21 @@ def next_image(source: ImageSource) -> Image:
 @contextmanager
 def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
     """Context manager: call ``act`` with 0, 1, 2 ... at this rate from a thread."""
-    stop, clock = threading.Event(), MonotonicClock()
+    clock = MonotonicClock()
 
-    def run() -> None:
+    def run(stop: threading.Event) -> None:
         due_ns, number = clock.now_ns(), 0
         while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
             act(number)
             number += 1
             due_ns += round(NS_PER_S / hz)
 
-    thread = threading.Thread(target=run, name="test-sender", daemon=True)
-    thread.start()
+    worker = Worker("test-sender", run)
+    worker.start()
     try:
         yield
     finally:
-        stop.set()
-        thread.join(5)
+        worker.join(5)
 
 
 class UdpSender:

@@ -1,6 +1,8 @@
-"""The command line, run inside the test."""
+"""The command line, run inside the test or in a process of its own."""
 
 import io
+import subprocess
+import sys
 from contextlib import redirect_stderr, redirect_stdout
 
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from mavbridge.__main__ import main
 from mavbridge.cli import cli
 from mavbridge.config.flight import FlyConfig
+from mavbridge.core.processes import child_environment
 
 
 def status_of(*arguments: object) -> int:
@@ -37,3 +40,17 @@ def asked_flight(*words: object) -> FlyConfig:
         patch.setattr("mavbridge.flight.app.fly", lambda config: asked.append(config) or 0)
         assert status_of(*words) == 0
     return asked[0]
+
+
+def printed_by(*words: str, timeout_s: float = 180.0) -> tuple[int, str]:
+    """Exit status and output of ``mavbridge`` in a process of its own, 200 columns wide."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mavbridge", *words],
+        env=child_environment() | {"COLUMNS": "200"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=timeout_s,
+    )
+    return done.returncode, done.stdout

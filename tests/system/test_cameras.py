@@ -2,8 +2,6 @@
 
 import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -22,10 +20,10 @@ from helpers.camera_senders import (
     repeating,
     scene,
 )
+from helpers.status import printed_by
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import MonotonicClock
-from mavbridge.core.processes import child_environment
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.meta import FlightError
 from sitl.camera.shm import FramePublisher
@@ -153,9 +151,5 @@ def test_a_depth_policy_is_flown_and_recorded_and_refused_with_a_camera_of_colou
         assert np.array_equal(image, depth_scene(int(image[0, 20]) - 2020))
     with pytest.raises(FlightError, match="holds depth"):
         next(recorded.rgb_images())
-    status = subprocess.run(
-        [sys.executable, "-m", "mavbridge", "replay", str(folder), "--policy", depth_policy],
-        env=os.environ | child_environment(),
-        check=False,
-    ).returncode
-    assert status == 0
+    status, output = printed_by("replay", str(folder), "--policy", depth_policy)
+    assert status == 0, output

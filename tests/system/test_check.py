@@ -1,33 +1,18 @@
 """A vehicle on the bench without a camera: checked, then flown by a policy that is blind."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from faults.stage import STARTS, TIMEOUT_S, was_stalled
+from faults.stage import STARTS, was_stalled
+from helpers.status import printed_by
 from mavbridge.core.errors import ExitCode
-from mavbridge.core.processes import child_environment, free_port, running
+from mavbridge.core.processes import free_port, running
 
 pytestmark = pytest.mark.system
 BLIND = ("--policy", "scripted:hover", "--camera", "none")
-
-
-def run(*words: str) -> tuple[int, str]:
-    """Exit status and output of one command."""
-    done = subprocess.run(
-        [sys.executable, "-m", "mavbridge", *words],
-        env=os.environ | child_environment() | {"COLUMNS": "200"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
-    return done.returncode, done.stdout
 
 
 def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None:
@@ -36,7 +21,7 @@ def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None
     link = ("--connect", f"udp:127.0.0.1:{port}")
     with running(*sitl, log=tmp_path / "sitl.log"):
         for _ in range(STARTS):  # the estimator may need a while on a busy machine
-            status, told = run("check", *link, *BLIND, "--json", str(report))
+            status, told = printed_by("check", *link, *BLIND, "--json", str(report))
             if status == ExitCode.DONE:
                 break
         assert status == ExitCode.DONE, told
@@ -46,7 +31,7 @@ def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None
 
         for _ in range(STARTS):
             fly = ("--mode", "ALT_HOLD", "--arm", "--duration", "1", "--report", str(report))
-            status, told = run(*link, *BLIND, *fly)
+            status, told = printed_by(*link, *BLIND, *fly)
             if not was_stalled(report):
                 break
         assert status == ExitCode.DONE, told
@@ -57,7 +42,7 @@ def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None
 def test_a_soak_measures_this_computer_at_the_bundled_vehicle(tmp_path: Path) -> None:
     report = tmp_path / "soak.json"
     words = ("--connect", "none", "--timing", "0.5", "--soak", "2", "--json", str(report))
-    status, told = run("check", *words)
+    status, told = printed_by("check", *words)
     assert status == ExitCode.DONE, told
     assert "NO-GO" not in told
     document = json.loads(report.read_text())

@@ -1,4 +1,4 @@
-"""Jobs in worker processes and on a local Ray cluster."""
+"""Jobs in worker processes and on a local Ray cluster, and an evaluation in several processes."""
 
 import os
 import signal
@@ -11,7 +11,9 @@ import pytest
 
 from helpers.worker_jobs import Job, run
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.config.episodes import WorkersConfig
+from mavbridge.commands.evaluate import evaluate
+from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 
 pytestmark = pytest.mark.system
@@ -80,3 +82,20 @@ def test_ray_has_the_same_results_though_a_worker_is_lost(
     three = [Job(number=10), Job(number=20, deaths=1, folder=tmp_path), Job(number=30)]
     flown = list(fly_jobs(run, three, config, lambda: False))
     assert sorted(flown) == [(0, 10), (1, 20), (2, 30)]
+
+
+CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
+
+
+def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
+    for workers in (1, 2):
+        config = EvaluateConfig(
+            policy=CIRCLE,
+            episodes=3,
+            max_time=1.0,
+            conditions="random",
+            workers=WorkersConfig(workers=workers),
+            json=tmp_path / f"{workers}.json",
+        )
+        assert evaluate(config) == 0
+    assert (tmp_path / "1.json").read_bytes() == (tmp_path / "2.json").read_bytes()

@@ -1,4 +1,4 @@
-"""Evaluation in several processes, and as a process of its own."""
+"""Evaluation as a process of its own."""
 
 import json
 import os
@@ -11,9 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.evaluate import evaluate
-from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
-from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.stopping import INTERRUPTED, ONE_REQUEST_NS
 
@@ -54,21 +51,6 @@ class Hanging(Single):
             threading.Event().wait()
         return super().predict(image, state, history, steps)
 """
-CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
-
-
-def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
-    for workers in (1, 2):
-        config = EvaluateConfig(
-            policy=CIRCLE,
-            episodes=3,
-            max_time=1.0,
-            conditions="random",
-            workers=WorkersConfig(workers=workers),
-            json=tmp_path / f"{workers}.json",
-        )
-        assert evaluate(config) == 0
-    assert (tmp_path / "1.json").read_bytes() == (tmp_path / "2.json").read_bytes()
 
 
 def evaluation(folder: Path, policy: str, output: int, *flags: str) -> subprocess.Popen[str]:

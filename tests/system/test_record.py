@@ -1,7 +1,6 @@
-"""A pilot's flight in real processes: recorded by ``mavbridge record``, then learnt from."""
+"""What a pilot shows, in real processes: recorded by ``mavbridge record`` or in a takeover."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,14 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.__main__ import main
+from faults.props import Transmitter
+from faults.stage import ORDERLY, staged
+from helpers.status import printed_by, status_of
 from mavbridge.core.processes import free_port
 from mavbridge.recording.flight_folder import open_flight
-from policy.data.flight_folders import read_flight
+from policy.data.flight_folders import leave_out_failed, read_flight
 
 pytestmark = pytest.mark.system
 
 TIMEOUT_S = 180.0
+FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--engage-channel", "7")
+PITCH_CHANNEL, FORWARD_US, SWITCH = 2, 1300, 7
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
 
 
@@ -41,27 +44,10 @@ def vehicle(folder: Path, port: int, *flags: str) -> Iterator[None]:
 
 def recorded(out: Path, port: int, *flags: str) -> str:
     """Record; what the command printed."""
-    command = [sys.executable, "-m", "mavbridge", "record", "--out", str(out)]
-    command += ["--connect", f"udp:127.0.0.1:{port}", "--camera", f"shm:record-{port}"]
-    done = subprocess.run(
-        [*command, *flags],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=TIMEOUT_S,
-        env=os.environ | {"COLUMNS": "200"},
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout
-    return done.stdout
-
-
-def status_of(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
+    link = ("--connect", f"udp:127.0.0.1:{port}", "--camera", f"shm:record-{port}")
+    status, printed = printed_by("record", "--out", str(out), *link, *flags)
+    assert status == 0, printed
+    return printed
 
 
 @pytest.fixture(scope="module")
@@ -111,3 +97,25 @@ def test_it_is_trained_from_and_exported(flown: Path, capsys: pytest.CaptureFixt
     assert "image ages of 20 to 90 ms are assumed" in " ".join(capsys.readouterr().err.split())
     assert status_of("export", flights, "--out", str(flown / "dataset")) == 0
     assert (flown / "dataset" / "meta" / "info.json").is_file()
+
+
+def test_a_pilot_who_takes_over_by_the_switch_labels_the_flight(tmp_path: Path) -> None:
+    transmitter, recording = Transmitter("mid"), tmp_path / "recording"
+    with staged(tmp_path, "--receiver", "mid", *transmitter.flags) as flying:
+        flying.start(*FLY, "--policy", "scripted:hover", "--record", str(recording))
+        assert flying.wait_for("FLYING: the policy has control")
+        flying.observe(4.0)
+        transmitter.move(PITCH_CHANNEL, FORWARD_US)
+        transmitter.move(SWITCH, 1000)
+        flying.observe(2.0)
+        transmitter.move(PITCH_CHANNEL, 1500)
+        flying.observe(0.5)
+        flying.kill_group(signal.SIGINT)
+        status, output = flying.end()
+    assert status in ORDERLY, output
+    exemplary, _ = leave_out_failed([recording], include_failed=False)
+    episode = read_flight(*exemplary)
+    assert len(episode.target) > 100
+    forward = episode.target[:, 2]
+    assert (forward > 0.3).mean() > 0.6  # a pilot's stick of 1300 us, pitch reversed
+    np.testing.assert_allclose(episode.target[:, [1, 3]], 0.0, atol=0.05)
