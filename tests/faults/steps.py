@@ -13,6 +13,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -79,11 +80,11 @@ def wall_clock(stage: Stage) -> int:
 def load(stage: Stage, *, s: float) -> int:
     """Load every core with other programs for a while."""
     at_ns, busy = stage.clock.now_ns(), [sys.executable, "-c", "while True: pass"]
-    hogs = [subprocess.Popen(busy) for _ in range(os.cpu_count() or 1)]
-    stage.observe(s)
-    for hog in hogs:
-        hog.kill()
-        hog.wait()
+    with ExitStack() as stack:
+        for _ in range(os.cpu_count() or 1):
+            hog = stack.enter_context(subprocess.Popen(busy))
+            stack.callback(hog.kill)
+        stage.observe(s)
     return at_ns
 
 
