@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.core.processes import free_port
+from mavbridge.core.processes import end, free_port
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_S, Clock
 
@@ -34,23 +34,18 @@ def need(program: str) -> None:
 @contextmanager
 def running(*command: str, cwd: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
     """A process with pipes, ended with the context."""
-    process = subprocess.Popen(
+    with subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         cwd=cwd,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    try:
-        yield process
-    finally:
-        process.terminate()
+    ) as process:
         try:
-            process.communicate(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+            yield process
+        finally:
+            end(process)
 
 
 class Console:
@@ -90,14 +85,18 @@ class Console:
         pytest.fail(f"no {answer!r} after {line!r}; last: {self.seen!r}")
 
 
+@contextmanager
+def vehicle(connect: str) -> Iterator[None]:
+    sitl = (sys.executable, "-m", "sitl", "--receiver", "idle", "--connect", connect)
+    with running(*sitl) as process:
+        assert Console(process).has("ready", DEADLINE_S)
+        yield
+
+
 def test_mavproxy_reads_parameters_changes_mode_and_arms(tmp_path):
     need("mavproxy.py")
     port = free_port(socket.SOCK_STREAM)
-    vehicle = running(
-        sys.executable, "-m", "sitl", "--receiver", "idle", "--connect", f"tcpin:127.0.0.1:{port}"
-    )
-    with vehicle as sitl:
-        assert Console(sitl).has("ready", DEADLINE_S)
+    with vehicle(f"tcpin:127.0.0.1:{port}"):
         proxy = running(
             str(PEERS / "python"),
             str(PEERS / "mavproxy.py"),
@@ -116,12 +115,8 @@ def test_mavproxy_reads_parameters_changes_mode_and_arms(tmp_path):
 
 def test_mavsdk_gets_parameters_telemetry_and_arms():
     need("python")
-    port = free_port(socket.SOCK_DGRAM)
-    vehicle = running(
-        sys.executable, "-m", "sitl", "--receiver", "idle", "--connect", f"udpout:127.0.0.1:{port}"
-    )
-    with vehicle as sitl:
-        assert Console(sitl).has("ready", DEADLINE_S)
+    port = free_port()
+    with vehicle(f"udpout:127.0.0.1:{port}"):
         client = running(str(PEERS / "python"), str(CLIENT), f"udpin://127.0.0.1:{port}")
         with client as mavsdk:
             console = Console(mavsdk)
