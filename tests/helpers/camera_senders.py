@@ -64,8 +64,8 @@ def next_image(source: ImageSource) -> Image:
 
 
 @contextmanager
-def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
-    """Context manager: call ``act`` with 0, 1, 2 ... at this rate from a thread."""
+def repeating(act: Callable[[int], None]) -> Iterator[None]:
+    """Context manager: call ``act`` with 0, 1, 2 ... at 30 Hz from a thread."""
     clock = MonotonicClock()
 
     def run(stop: threading.Event) -> None:
@@ -73,7 +73,7 @@ def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
         while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
             act(number)
             number += 1
-            due_ns += round(NS_PER_S / hz)
+            due_ns += round(NS_PER_S / HZ)
 
     worker = Worker("test-sender", run)
     worker.start()

@@ -48,7 +48,6 @@ ALOFT = AirborneStart(
     ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
     next_gate=0,
 )
-SIGNAL = because(Code.SIGNAL)
 HOVER = (0.0, 0.0, 0.0, 0.0)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
 Policy = Callable[[float], tuple[float, float, float, float]]
@@ -182,9 +181,9 @@ class GuardFlight:
         """Perform an explicit act at the terminal."""
         self.tell(act)
 
-    def stop(self, reason: Reason = SIGNAL, *, is_fault: bool = False) -> None:
-        """Request the end: Ctrl-C, or a fault that the flight process can still report."""
-        self.tell(EndRequest(reason=reason, is_fault=is_fault))
+    def stop(self) -> None:
+        """Request the end by Ctrl-C."""
+        self.tell(EndRequest(reason=because(Code.SIGNAL)))
 
     def die(self) -> None:
         """Kill the flight process: the guard reads the end of file."""

@@ -92,12 +92,10 @@ class OutputFlight(GuardFlight):
         program: Program = LEANING,
         *,
         in_air: bool = True,
-        receiver_us: tuple[int, ...] | None = None,
-        params: dict[str, float] | None = None,
         px4_release: Px4Release = "1.18",
         **config: Any,
     ) -> None:
-        """``config`` as in ``GuardFlight``. ``receiver_us=None`` is MID for ArduPilot."""
+        """``config`` as in ``GuardFlight``. ArduPilot has a receiver with centred sticks."""
         self.autopilot, self.kind, self.is_px4 = autopilot, kind, autopilot == "px4"
         self.mode = FLIGHT_MODES[autopilot, kind]
         self.samples: list[Sample] = []
@@ -105,12 +103,9 @@ class OutputFlight(GuardFlight):
         self._program = program
         self._nan_from_ns: int | None = None
         self._boot_ns = 0
-        if not self.is_px4:
-            params = {"GUID_OPTIONS": 8.0, **(params or {})}
-            receiver_us = receiver_us or MID_RECEIVER_US
         super().__init__(
-            receiver_us=receiver_us,
-            params=params,
+            receiver_us=None if self.is_px4 else MID_RECEIVER_US,
+            params=None if self.is_px4 else {"GUID_OPTIONS": 8.0},
             vehicle=replace(NOMINAL_VEHICLE, autopilot=autopilot, px4_release=px4_release),
             **config,
         )

@@ -129,7 +129,7 @@ class Px4Companion(Companion):
         name = f"UNKNOWN_{CURRENT_MODE}"
         return decode_current_mode(self.request(CURRENT_MODE, name)).custom_mode
 
-    def track(self, hz: float = 50) -> None:
+    def track(self) -> None:
         """Stream modes, attitude, position and landed state at high rates."""
         for message_id in (
             mav.MAVLINK_MSG_ID_ATTITUDE,
@@ -137,7 +137,7 @@ class Px4Companion(Companion):
             mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
             CURRENT_MODE,
         ):
-            assert self.stream(message_id, hz) == ACCEPTED
+            assert self.stream(message_id, 50) == ACCEPTED
 
     def get_ready(self, mode: tuple[int, int]) -> None:
         """Wait until the vehicle can be armed in a mode, with sticks centred; do not arm."""

@@ -84,12 +84,12 @@ def noise_runner(contract: Contract | None = None) -> PolicyRunner:
     )
 
 
-def make_start(config: WorldModelConfig = TINY) -> RolloutStart:
+def make_start() -> RolloutStart:
     random = np.random.default_rng(0)
-    shape = (config.context_frames, config.image_size, config.image_size, 3)
+    shape = (TINY.context_frames, TINY.image_size, TINY.image_size, 3)
     return RolloutStart(
         images=random.integers(0, 255, shape).astype(np.uint8),
-        states=np.stack([make_state().values] * config.context_frames),
+        states=np.stack([make_state().values] * TINY.context_frames),
         newest_ns=START_NS,
         sent=((START_NS - NS_PER_S, Sticks(0.1, 0.2, 0.3, 0.4)),),
     )

@@ -42,7 +42,7 @@ def asked_flight(*words: object) -> FlyConfig:
     return asked[0]
 
 
-def printed_by(*words: str, timeout_s: float = 180.0) -> tuple[int, str]:
+def printed_by(*words: str) -> tuple[int, str]:
     """Exit status and output of ``mavbridge`` in a process of its own, 200 columns wide."""
     done = subprocess.run(
         [sys.executable, "-m", "mavbridge", *words],
@@ -51,6 +51,6 @@ def printed_by(*words: str, timeout_s: float = 180.0) -> tuple[int, str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=timeout_s,
+        timeout=180.0,
     )
     return done.returncode, done.stdout

@@ -16,7 +16,7 @@ ACCELERATION_MPS2 = 6.0
 FIELD_OF_VIEW_RAD = 2.0
 
 
-def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> FlightData:
+def steered_flight(seed: int, *, seconds: float = 3.0) -> FlightData:
     """Write a flight: yaw turns the view past a far bright spot; pitch accelerates along it.
 
     Ticks at 100 Hz, frames at 30 Hz. The expert's labels differ from the sent sticks.
@@ -43,7 +43,7 @@ def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Flight
     def decode() -> Iterator[NDArray[np.uint8]]:
         for angle in seen_at:
             across = -2 * np.arctan2(np.sin(angle), np.cos(angle)) / FIELD_OF_VIEW_RAD
-            yield spot(size, float(across)) if abs(across) <= 1 else spot(size, -9.0)
+            yield spot(32, float(across)) if abs(across) <= 1 else spot(32, -9.0)
 
     return FlightData(
         name=f"steered {seed}",

@@ -54,13 +54,14 @@ class WireEnd:
     def heartbeat(
         self,
         *,
-        vehicle_type: int = dialect.MAV_TYPE_QUADROTOR,
         autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
         mode: int = 2,
         armed: bool = False,
     ) -> bytes:
         base = 1 | (128 if armed else 0)
-        return self.pack(self.mav.heartbeat_encode(vehicle_type, autopilot, base, mode, 3))
+        return self.pack(
+            self.mav.heartbeat_encode(dialect.MAV_TYPE_QUADROTOR, autopilot, base, mode, 3)
+        )
 
 
 def sent(data: bytes) -> dialect.MAVLink_message:

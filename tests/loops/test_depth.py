@@ -61,8 +61,9 @@ def depth_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 class HoldsDistance:
     """Climbs until the ground below is as far as it should be."""
 
-    def __init__(self, contract: Contract = DEPTH) -> None:
-        self.contract = contract
+    contract = DEPTH
+
+    def __init__(self) -> None:
         self.seen: list[np.ndarray] = []
 
     def predict(self, image: Any, state: Any, history: Any, steps: int) -> np.ndarray:

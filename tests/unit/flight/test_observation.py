@@ -67,8 +67,8 @@ def source(
     return looks
 
 
-def cache_of(*ago_ms: float, span_ms: int = 200) -> FeatureCache:
-    cache = FeatureCache(span_ns=span_ms * MS)
+def cache_of(*ago_ms: float) -> FeatureCache:
+    cache = FeatureCache(span_ns=200 * MS)
     for each_ms in ago_ms:
         cache.publish(seen(each_ms))
     return cache
