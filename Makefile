@@ -66,7 +66,7 @@ fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flyi
 	@$(BIN)/python -m sitl course --course $(COURSE) --laps $(LAPS) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
 		--camera shm:fpv-$(PORT) --course $(COURSE) --laps $(LAPS) --fly-on 10 --report out/fc.json & sitl=$$!; \
-	trap 'kill $$sitl 2>/dev/null' EXIT; \
+	trap 'kill $$sitl 2>/dev/null' EXIT; trap : INT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
 		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(LANDED) $(BRIEF) $(BY_RATES) $(FLAGS) \
 		$(SAVED) --gates out/gates.json --report out/report.json; status=$$?; \

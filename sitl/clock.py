@@ -54,12 +54,16 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """Context manager: SIGINT and SIGTERM set the flag; the old handlers return at the end."""
+    """Context manager: SIGINT and SIGTERM set the flag; the old handlers return at the end.
+
+    Ignored ones stay ignored: shells ignore SIGINT for programs that they start in the background.
+    """
     stop = StopRequest()
     signals = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]
+    handled = [one for one in signals if signal.getsignal(one) is not signal.SIG_IGN]
+    previous = {one: signal.signal(one, lambda *_: stop.set()) for one in handled}
     try:
         yield stop
     finally:
-        for number, handler in zip(signals, previous, strict=True):
+        for number, handler in previous.items():
             signal.signal(number, handler)

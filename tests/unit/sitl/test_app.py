@@ -1,6 +1,7 @@
 """The real-time loop on a fake clock, the camera thread, and the command line."""
 
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
 from sitl.app import fly
-from sitl.clock import NS_PER_MS, NS_PER_S, StopRequest
+from sitl.clock import NS_PER_MS, NS_PER_S, StopRequest, stop_on_signal
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
 
@@ -84,6 +85,18 @@ def test_a_terminated_process_flies_on_and_writes_the_report(tmp_path):
     report = json.loads(path.read_text())
     assert report["final"]["mode"] == "STABILIZE"
     assert report["duration_s"] >= 0.49
+
+
+def test_ctrl_c_does_not_stop_a_vehicle_that_a_shell_started_in_the_background():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_on_signal() as stop:
+            signal.raise_signal(signal.SIGINT)
+            assert not stop.is_set()
+            signal.raise_signal(signal.SIGTERM)
+            assert stop.is_set()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(
