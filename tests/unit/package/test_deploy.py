@@ -30,6 +30,9 @@ def test_the_sample_settings_are_understood() -> None:
     config = asked_flight("--config", sample, "--set-config", "envelope.height=20")
     assert list(untrusted_settings(read_toml(sample), [])) == []
     assert config.link.connect == "/dev/ttyACM0,921600"
+    unit = (DEPLOY / "mavbridge.service").read_text()
+    assert "After=network.target dev-ttyACM0.device" in unit
+    assert "/dev/video0" in unit
     assert config.engage_channel == 8
     assert not config.arm
     assert config.camera.camera == ("/dev/video0",)
