@@ -237,7 +237,7 @@ def _absent(path: Path) -> str:
             if file.read(len(MAGIC)) == MAGIC:
                 others.append(other.name)
     return (
-        f"shm:{path.name}: there is none. Start its "
-        f"writer, for example: python -m sitl --camera shm:{path.name} "
+        f"shm:{path.name}: there is none. Start its writer, for example: "
+        f"python -m sitl --connect udpout:127.0.0.1:14550 --camera shm:{path.name} "
         f"(frame segments here now: {', '.join(others) or 'none'})"
     )

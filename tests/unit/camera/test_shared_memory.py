@@ -147,7 +147,8 @@ def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(camera, writ
 def test_a_name_that_is_not_there_says_what_to_start_and_what_is_there(writer, clock):
     camera = SharedMemoryCamera("nobody", clock=clock)
     assert camera.read(0) is None
-    assert "python -m sitl --camera shm:nobody" in camera.waiting_reason
+    writer_command = "python -m sitl --connect udpout:127.0.0.1:14550 --camera shm:nobody"
+    assert writer_command in camera.waiting_reason
     assert writer.path.name in camera.waiting_reason
     camera.close()
 
