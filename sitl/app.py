@@ -68,11 +68,13 @@ def fly(
         clock.sleep_until_ns(due_ns)
 
 
-def fly_on(vehicle: SimulatedVehicle, duration_s: float) -> None:
+def fly_on(vehicle: SimulatedVehicle, duration_s: float, stop: StopRequest) -> None:
     """Advance the vehicle as fast as the computer can, without receiving or sending."""
     status = _Status(vehicle)
     start_ns = vehicle.ap.now_ns
     for now_ns in range(start_ns, start_ns + round(duration_s * NS_PER_S), STEP_NS):
+        if stop.is_set():
+            break
         vehicle.step(now_ns)
         for link_id in range(len(vehicle.server.links)):
             vehicle.take_outgoing(link_id)
@@ -259,7 +261,8 @@ def _fly(args: argparse.Namespace) -> None:
             fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
         if args.fly_on:
             os.nice(LEAST_PRIORITY)
-            fly_on(vehicle, args.fly_on)
+            with stop_on_signal() as stop:  # the signal that ended the flight does not count
+                fly_on(vehicle, args.fly_on, stop)
         if args.report is not None:
             with _writing(args.report):
                 write_report(args.report, vehicle.log.summary(vehicle.ap))

@@ -87,6 +87,22 @@ def test_a_terminated_process_flies_on_and_writes_the_report(tmp_path):
     assert report["duration_s"] >= 0.49
 
 
+def test_a_second_signal_ends_the_flight_on_and_the_report_is_written(monkeypatch, tmp_path):
+    path, signals = tmp_path / "fc.json", []
+
+    def interrupt(*_, **__):
+        signals.append(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("sitl.app.fly", interrupt)
+    monkeypatch.setattr("sitl.app._Status.print_changes", interrupt)  # once a step of the fly-on
+    monkeypatch.setattr("sitl.app.os.nice", lambda _: 0)
+    flags = ["--connect", "udpout:127.0.0.1:9", "--fly-on", "1"]
+    assert main([*flags, "--report", str(path)]) == 0
+    assert len(signals) == 2
+    assert path.exists()
+
+
 def test_ctrl_c_does_not_stop_a_vehicle_that_a_shell_started_in_the_background():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
