@@ -175,9 +175,9 @@ def _parser() -> argparse.ArgumentParser:
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
     add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")
-    add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
+    add("--duration", type=_SECONDS, metavar="S", help="stop after S seconds")
     fly_on_help = "before the report, fly S seconds more without links, faster than real time"
-    add("--fly-on", type=_POSITIVE, default=0.0, metavar="S", help=fly_on_help)
+    add("--fly-on", type=_SECONDS, default=0.0, metavar="S", help=fly_on_help)
     receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
     receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
     add("--receiver", choices=tuple(RECEIVERS), help=receiver_help)
@@ -187,7 +187,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--pilot", choices=PILOTS, help=pilot_help)
     axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
     add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
-    add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
+    add("--pilot-speed", type=_SPEED, default=4.0, metavar="MPS", help="of the expert")
     key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
     add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
     _add_camera_flags(parser)
@@ -212,7 +212,7 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
     _add_course_flags(parser)
     size_help = "side of the square image (default: 224)"
     add("--image-size", type=_IMAGE_SIZE, metavar="PIXELS", help=size_help)
-    add("--fps", type=_POSITIVE, metavar="HZ", help="frame rate (default: 30)")
+    add("--fps", type=_FPS, metavar="HZ", help="frame rate (default: 30)")
 
 
 def _add_course_flags(parser: argparse.ArgumentParser) -> None:
@@ -342,7 +342,9 @@ def _number(
     return convert
 
 
-_POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
+_SECONDS = _number(float, sys.float_info.min, 1e6, "a positive number of seconds, at most 1e6")
+_FPS = _number(float, 0.1, 1000, "0.1 to 1000 Hz")
+_SPEED = _number(float, 0.1, 100, "0.1 to 100 m/s")
 _SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
 _LAPS = _number(int, 1, 10_000, "a number of laps, 1 to 10000")
 _PORT = _number(int, 1, 65535, "a port, 1 to 65535")
