@@ -307,7 +307,7 @@ def _film(args: argparse.Namespace) -> None:
             "camera --follow needs --camera shm:NAME, the name to publish frames under"
         )
     with stop_on_signal() as stop:
-        film_vehicle(args.follow, make_course(args.course), _camera(args), stop.is_set)
+        film_vehicle(args.follow, course, _camera(args), stop.is_set)
 
 
 def _camera(args: argparse.Namespace) -> CameraOptions:
@@ -323,6 +323,7 @@ def _print_course(args: argparse.Namespace) -> None:
     for gate in course.gates:
         north, east, down = gate.center_ned_m
         sys.stdout.write(
+    course = make_course(args.course, args.laps)
             f"{gate.index:4d}  {north:7.1f}  {east:6.1f}  {-down:4.1f}  "
             f"{math.degrees(gate.yaw_rad):7.1f}  {gate.size_m:6.1f}\n"
         )

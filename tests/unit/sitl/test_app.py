@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.__main__ import main
 from sitl.app import fly
 from sitl.clock import NS_PER_MS, NS_PER_S, StopRequest, stop_on_signal
+from sitl.course import LOOP_SEEDS, make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
 
@@ -101,6 +102,14 @@ def test_a_second_signal_ends_the_flight_on_and_the_report_is_written(monkeypatc
     assert main([*flags, "--report", str(path)]) == 0
     assert len(signals) == 2
     assert path.exists()
+
+
+def test_the_camera_of_another_vehicle_films_each_lap(monkeypatch):
+    filmed = []
+    monkeypatch.setattr("sitl.app.film_vehicle", lambda *arguments: filmed.append(arguments[1]))
+    flags = ["--follow", "udp:127.0.0.1:9", "--camera", "shm:x", "--course", str(LOOP_SEEDS)]
+    assert main(["camera", *flags, "--laps", "2"]) == 0
+    assert filmed == [make_course(LOOP_SEEDS, laps=2)]
 
 
 def test_ctrl_c_does_not_stop_a_vehicle_that_a_shell_started_in_the_background():
