@@ -115,10 +115,18 @@ class _Status:
 
 @contextmanager
 def filming(
-    vehicle: SimulatedVehicle, course: Course, camera: CameraOptions, clock: Clock
+    vehicle: SimulatedVehicle,
+    course: Course,
+    camera: CameraOptions,
+    clock: Clock,
+    flight_stop: StopRequest,
 ) -> Iterator[None]:
-    """Context manager: publish the vehicle's FPV view from a separate thread."""
+    """Context manager: publish the vehicle's FPV view from a separate thread.
+
+    An error in the thread stops the flight, and is raised at the end of the block.
+    """
     stop = threading.Event()
+    errors: list[Exception] = []
     size = (camera.image_size, camera.image_size)
     renderer = FpvRenderer(course, *size, vehicle.ap.config.conditions)
     publisher = FramePublisher(camera.shm_name, *size)
@@ -137,7 +145,14 @@ def filming(
             publisher.publish(image, pose.stamp_ns)
             due_ns = next_slot_ns(due_ns, period_ns, clock.now_ns())
 
-    thread = threading.Thread(target=film, name="sitl-camera", daemon=True)
+    def film_or_stop() -> None:
+        try:
+            film()
+        except Exception as error:  # noqa: BLE001 - raised again by the main thread
+            errors.append(error)
+            flight_stop.set()
+
+    thread = threading.Thread(target=film_or_stop, name="sitl-camera", daemon=True)
     thread.start()
     try:
         yield
@@ -145,6 +160,8 @@ def filming(
         stop.set()
         thread.join(JOIN_TIMEOUT_S)
         publisher.close()
+    if errors:
+        raise errors[0]
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -254,7 +271,7 @@ def _fly(args: argparse.Namespace) -> None:
             print_status(line)
         stop = stack.enter_context(stop_on_signal())
         films = args.camera is not None
-        with filming(vehicle, course, _camera(args), clock) if films else nullcontext():
+        with filming(vehicle, course, _camera(args), clock, stop) if films else nullcontext():
             print_status("ready on " + ", ".join(urls))
             is_endless = args.duration is None
             end_ns = None if is_endless else clock.now_ns() + round(args.duration * NS_PER_S)
@@ -306,6 +323,7 @@ def _film(args: argparse.Namespace) -> None:
         raise UsageError(
             "camera --follow needs --camera shm:NAME, the name to publish frames under"
         )
+    course = make_course(args.course, args.laps)
     with stop_on_signal() as stop:
         film_vehicle(args.follow, course, _camera(args), stop.is_set)
 
@@ -323,7 +341,6 @@ def _print_course(args: argparse.Namespace) -> None:
     for gate in course.gates:
         north, east, down = gate.center_ned_m
         sys.stdout.write(
-    course = make_course(args.course, args.laps)
             f"{gate.index:4d}  {north:7.1f}  {east:6.1f}  {-down:4.1f}  "
             f"{math.degrees(gate.yaw_rad):7.1f}  {gate.size_m:6.1f}\n"
         )

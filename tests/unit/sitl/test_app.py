@@ -1,6 +1,7 @@
 """The real-time loop on a fake clock, the camera thread, and the command line."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -102,6 +103,16 @@ def test_a_second_signal_ends_the_flight_on_and_the_report_is_written(monkeypatc
     assert main([*flags, "--report", str(path)]) == 0
     assert len(signals) == 2
     assert path.exists()
+
+
+def test_a_camera_that_fails_ends_the_flight_with_its_error(monkeypatch):
+    def fail(*_):
+        raise OSError("the lens is broken")
+
+    monkeypatch.setattr("sitl.app.FramePublisher.publish", fail)
+    flags = ["--camera", f"shm:mb-test-app-{os.getpid()}", "--duration", "20"]
+    with pytest.raises(OSError, match="the lens is broken"):
+        main(["--connect", "udpout:127.0.0.1:9", *flags])
 
 
 def test_the_camera_of_another_vehicle_films_each_lap(monkeypatch):
