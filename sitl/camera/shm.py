@@ -105,11 +105,15 @@ class FramePublisher:
 def _create(path: Path, header: bytes, size: int) -> tuple[mmap.mmap, int]:
     """Create the file under a temporary name, then rename it: no reader sees half a header."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
-    with draft.open("w+b") as file:
-        file.truncate(size)
-        file.write(MAGIC + header + struct.pack("<QQ", 0, LIVE))
-        file.flush()
-        mapped = mmap.mmap(file.fileno(), size)
-        inode = os.fstat(file.fileno()).st_ino
-    draft.replace(path)
+    try:
+        with draft.open("w+b") as file:
+            file.truncate(size)
+            file.write(MAGIC + header + struct.pack("<QQ", 0, LIVE))
+            file.flush()
+            mapped = mmap.mmap(file.fileno(), size)
+            inode = os.fstat(file.fileno()).st_ino
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
     return mapped, inode

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl import UsageError
 from sitl.camera.shm import FramePublisher
 
 WIDTH, HEIGHT = 10, 6
@@ -69,3 +70,14 @@ def test_frames_that_are_not_whole_stay_marked_as_being_written(publisher, name)
         publisher.publish(grey(number), number)
     (sequence,) = struct.unpack_from("<q", raw(name), 64 + STRIDE)
     assert sequence == 2
+
+
+def test_a_name_that_cannot_be_taken_leaves_nothing_behind(name):
+    taken = Path("/dev/shm", name)
+    taken.mkdir()
+    try:
+        with pytest.raises(UsageError, match=name):
+            FramePublisher(name, WIDTH, HEIGHT)
+        assert not list(taken.parent.glob(f".{name}.*"))
+    finally:
+        taken.rmdir()
