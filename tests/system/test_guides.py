@@ -51,7 +51,8 @@ def here(words: Sequence[str], ports: dict[str, str], folder: Path) -> list[str]
     if program == "mavbridge":
         return [sys.executable, "-m", "mavbridge", *rest]
     if program == "mavproxy.py":
-        return [str(PEERS / "python"), str(PEERS / program), *rest]
+        log = f"--logfile={folder.with_suffix('.tlog')}"
+        return [str(PEERS / "python"), str(PEERS / program), log, *rest]
     assert program == "python"
     return [sys.executable, *rest]
 
