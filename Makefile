@@ -114,8 +114,8 @@ EPOCH = $(shell git log -1 --format=%ct)
 dist: .venv-release/installed  ## wheel and sdist of HEAD in dist/, checked; one commit gives the same bits anywhere
 	rm -rf dist && mkdir -p dist/tree
 	git -c tar.umask=0022 archive HEAD | tar -xp -C dist/tree
-	umask 022; cd dist/tree; SOURCE_DATE_EPOCH=$(EPOCH) PIP_CONSTRAINT=$(CURDIR)/constraints.txt \
-		$(CURDIR)/.venv-release/bin/python -m build --outdir .. > ../build.log 2>&1 || { cat ../build.log; exit 1; }
+	umask 022; cd dist/tree; SOURCE_DATE_EPOCH=$(EPOCH) PIP_CONSTRAINT=constraints.txt \
+		../../.venv-release/bin/python -m build --outdir .. > ../build.log 2>&1 || { cat ../build.log; exit 1; }
 	# setuptools dates and owns the files of an sdist by the moment and the person of its build
 	cd dist && tar -xzf mavbridge-*.tar.gz && rm -r mavbridge-*.tar.gz tree build.log && for tree in mavbridge-*/; do \
 		tar --sort=name --mtime=@$(EPOCH) --owner=0 --group=0 --numeric-owner --mode=u=rwX,go=rX \
