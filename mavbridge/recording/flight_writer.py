@@ -94,9 +94,9 @@ class FlightWriter:
         self.video_failure: WriterDiedError | None = None
         """Why frames of a camera are no longer recorded while the rest is."""
         self._source_size: tuple[int, int] | None = None
-        self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
-        """Groups of packets in order of arrival; filled by another thread."""
-        self._packets_lost = 0
+        self.packets: BoundedQueue[ForwardedPacket] = BoundedQueue(PACKET_CAPACITY)
+        """Packets in order of arrival; filled by another thread."""
+        self._packet_serials, self._packets_dropped = SerialNumbers(), 0
         try:
             self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
             write_meta(folder, meta)
@@ -184,9 +184,10 @@ class FlightWriter:
     def flush(self) -> None:
         """Hand all rows to the kernel."""
         if self._packets is not None:
-            for packet in (packet for group in self.packets.take() for packet in group):
-                lost, self._packets_lost = self._packets_lost, self.packets.dropped
-                self._packets.add(replay_tables.packet_columns(packet, self._packets_lost - lost))
+            for packet in self.packets.take():
+                skipped = self._packet_serials.take(self._packets.rows + self._packets_dropped)
+                self._packets.add(replay_tables.packet_columns(packet, skipped))
+            self._packets_dropped = self.packets.dropped  # behind those: the queue was full
         for table in self._tables:
             table.flush()
 

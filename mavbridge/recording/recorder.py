@@ -76,7 +76,8 @@ class Recorder(ObserverThread):
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Queue the stamps of received packets, or drop and count them. For one thread only."""
-        self._flight.writer.packets.put(packets)
+        for packet in packets:
+            self._flight.writer.packets.put(packet)
 
     @property
     def dropped(self) -> int:

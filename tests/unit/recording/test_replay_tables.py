@@ -14,7 +14,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording import replay_tables
+from mavbridge.recording import flight_writer, replay_tables
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import SETTINGS
 from mavbridge.recording.meta import FlightError
@@ -98,15 +98,22 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     assert down["dropped_before"].to_pylist() == [2]
 
 
-def test_a_single_rate_flight_keeps_packets_and_no_images_as_features(tmp_path: Path) -> None:
+def test_a_single_rate_flight_keeps_packets_and_no_images_as_features(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flight_writer, "PACKET_CAPACITY", 2)
     writer = record(tmp_path, mode="single")
-    writer.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
+    for stamps_ns in ((7, 5), (9, 9), (11, 11), (12, 12)):  # the last two find the queue full
+        writer.packets.put(ForwardedPacket(*stamps_ns, HEARTBEAT))
+    writer.flush()
+    writer.packets.put(ForwardedPacket(13, 13, HEARTBEAT))
     writer.frame(make_frame(0, feature=np.zeros((1, 3, 8, 8), np.float32)))
     writer.finish(writer.meta)
 
-    first, second = read_packets(read_table(tmp_path / "packets", replay_tables.PACKETS))
+    table = read_table(tmp_path / "packets", replay_tables.PACKETS)
 
-    assert (first, second) == ((7, 5, 0, 7), (9, 9, 0, 7))
+    assert list(read_packets(table)) == [(7, 5, 0, 7), (9, 9, 0, 7), (13, 13, 0, 7)]
+    assert table["dropped_before"].to_pylist() == [0, 0, 2]
     assert packet_key(HEARTBEAT) == (0, 7)
     assert not [*tmp_path.glob("features*")]
 
