@@ -125,26 +125,23 @@ class TimingPlots:
 
     def show_ticks(self, ticks: Sequence[Tick]) -> None:
         """Plot the ages, and the lateness of the sends in slots."""
-        ages_ns = [
+        self._spreads[layout.IMAGE_AGE].extend(
             (tick.sent_ns, tick.sent_ns - tick.feature_captured_ns)
             for tick in ticks
             if tick.feature_captured_ns is not None
-        ]
-        self._spreads[layout.IMAGE_AGE].extend(ages_ns)
-        ages_ns = [
+        )
+        self._spreads[layout.ATTITUDE_AGE].extend(
             (tick.sent_ns, tick.sent_ns - tick.state.attitude_ns)
             for tick in ticks
             if tick.state is not None
             # Without a chunk the state is the newest when the tick is read, perhaps a later one.
             and (tick.trace is not None or tick.state.attitude_ns <= tick.sent_ns)
-        ]
-        self._spreads[layout.ATTITUDE_AGE].extend(ages_ns)
-        late_ns = [
+        )
+        self._spreads[layout.LATENESS].extend(
             (tick.sent_ns, max(0, tick.sent_ns - tick.due_ns))
             for tick in ticks
             if tick.is_slot and tick.trace is not None
-        ]
-        self._spreads[layout.LATENESS].extend(late_ns)
+        )
         self._show_chunks(ticks)
         self._missed_slots += sum(tick.missed_slots for tick in ticks)
         last_ns = ticks[-1].woke_ns
@@ -154,23 +151,18 @@ class TimingPlots:
 
     def _show_chunks(self, ticks: Sequence[Tick]) -> None:
         """Plot the periods and the computing times of the flown chunks."""
-        news: list[Tick] = []
-        last = self._last_chunk
         for tick in ticks:
+            last, self._last_chunk = self._last_chunk, None  # without a chunk there is no period
             if tick.chunk_serial is None or tick.chunk_computed_ns is None:
-                last = None  # time without a chunk is not a period
                 continue
-            newest = (tick.chunk_serial, tick.chunk_computed_ns)
+            newest = self._last_chunk = (tick.chunk_serial, tick.chunk_computed_ns)
             if last is not None and (count := newest[0] - last[0]) > 0:
                 # Also counts chunks that a newer one overtook before any send, as the report does.
                 period_ns = (newest[1] - last[1]) // count
                 self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
-            if last is None or newest[0] != last[0]:
-                news.append(tick)
-            last = newest
-        self._last_chunk = last
-        predict_ns = [(new.sent_ns, new.predict_ns) for new in news if new.predict_ns is not None]
-        self._spreads[layout.PREDICT].extend(predict_ns)
+            is_new = last is None or newest[0] != last[0]
+            if is_new and tick.predict_ns is not None:
+                self._spreads[layout.PREDICT].extend([(tick.sent_ns, tick.predict_ns)])
 
     def _show_channels(self, ticks: Sequence[Tick]) -> None:
         width = len(layout.RC.series)
