@@ -65,7 +65,6 @@ class Recorder(ObserverThread):
                 writer.close()
                 raise
         self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
-        self._packets_dropped = packets_dropped
         super().__init__(
             "mavbridge-recorder",
             self._flight,
@@ -82,7 +81,7 @@ class Recorder(ObserverThread):
     @property
     def dropped(self) -> int:
         """Number of ticks, frames and packets missing from the recording; exact after ``close``."""
-        packets = self._packets_dropped() + self._flight.writer.packets.dropped
+        packets = self._flight.packets_dropped() + self._flight.writer.packets.dropped
         return super().dropped + self._flight.frames_lost + packets
 
     @property

@@ -64,7 +64,6 @@ class TickRow(NamedTuple):
 _STICKS = pa.list_(pa.float32(), ACTION_DIM)
 _VECTOR = pa.list_(pa.float32(), 3)
 STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
-_TRACE = ("raw", "clipped", "slewed", "smoothed")
 _TRUTH = tuple(field.name for field in fields(FrameTruth))
 
 
@@ -79,7 +78,7 @@ TICKS = pa.schema(
         *_fields(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
         pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
         *_fields(pa.int64(), *STATE_STAMPS),
-        *_fields(_STICKS, *_TRACE, "sent", "rc_sticks"),
+        *_fields(_STICKS, *ActionTrace._fields, "sent", "rc_sticks"),
         pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
         *_fields(pa.string(), "release_reason", "release_code", "release_data", "mode"),
         pa.field("armed", pa.bool_(), nullable=False),
@@ -126,7 +125,7 @@ def tick_columns(row: TickRow) -> Row:
         **attributes(tick, _TICK),
         **_reason_columns(tick.release_reason),
         **attributes(tick.state, STATE_STAMPS),
-        **attributes(tick.trace, _TRACE),
+        **attributes(tick.trace, ActionTrace._fields),
         "state": None if tick.state is None else tick.state.values,
         **attributes(row, ("expert", "dropped_before")),
     }
@@ -196,7 +195,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
         array.setflags(write=False)
         state = VehicleState(values=array, **{name: row[name] for name in STATE_STAMPS})
     if row["raw"] is not None:
-        trace = ActionTrace(**{name: make(*row[name]) for name in _TRACE})
+        trace = ActionTrace(**{name: make(*row[name]) for name in ActionTrace._fields})
     return Tick(**values | {"serial": serial, "state": state, "trace": trace})
 
 

@@ -18,7 +18,6 @@ from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
 
 Array: TypeAlias = NDArray[np.float64]
-STAGES = ("raw", "clipped", "slewed", "smoothed")
 PAST_INPUTS = ("states", "history")
 """Inputs that a policy with the recorded contract gets from the recording. Rebuilt ones may differ
 if the recording lacks a solve without a chunk, or a tick in transit."""
@@ -171,7 +170,7 @@ def _other_results(step: GuardStep) -> list[str]:
 
 def _results(tick: Tick | GuardTick, phase: str | None) -> dict[str, object]:
     """Return the results of a pass by name, in single precision, that of a recording."""
-    stages = {stage: getattr(tick.trace, stage, None) for stage in STAGES}
+    stages = {stage: getattr(tick.trace, stage, None) for stage in ActionTrace._fields}
     actions = {name: _single(action) for name, action in (stages | {"sent": tick.sent}).items()}
     return {"phase": phase, "chunk": tick.chunk_serial, **actions}
 
