@@ -35,32 +35,31 @@ def test_a_file_is_tried_and_not_left_behind(tmp_path: Path) -> None:
     assert path.read_text() == "an older flight"
 
 
-@pytest.mark.parametrize("text", ["", "Spawn", "flight.mp4", "http://127.0.0.1:9876"])
-def test_an_unknown_target_is_refused_with_the_choices(text: str) -> None:
-    with pytest.raises(UserError, match=r"spawn, connect, connect=URL, FILE\.rrd, off"):
-        prepare_target(text)
+CHOICES = r"spawn, connect, connect=URL, FILE\.rrd, off"
+EXAMPLE = r"look like rerun\+http://127\.0\.0\.1:9876/proxy"
 
 
 @pytest.mark.parametrize(
-    "url",
+    ("text", "told"),
     [
-        *("http://127.0.0.1:9876/proxy", "rerun+http://127.0.0.1/proxy"),
-        *("rerun+http://:9876/proxy", "rerun+http://127.0.0.1:9876"),
-        "rerun+http://127.0.0.1:99999/proxy",
+        *(("", CHOICES), ("Spawn", CHOICES), ("flight.mp4", CHOICES)),
+        ("http://127.0.0.1:9876", CHOICES),
+        ("connect=http://127.0.0.1:9876/proxy", EXAMPLE),
+        ("connect=rerun+http://127.0.0.1/proxy", EXAMPLE),
+        ("connect=rerun+http://:9876/proxy", EXAMPLE),
+        ("connect=rerun+http://127.0.0.1:9876", EXAMPLE),
+        ("connect=rerun+http://127.0.0.1:99999/proxy", EXAMPLE),
     ],
 )
-def test_a_malformed_url_is_refused_with_an_example(url: str) -> None:
-    with pytest.raises(UserError, match=r"look like rerun\+http://127\.0\.0\.1:9876/proxy"):
-        prepare_target(f"connect={url}")
+def test_a_target_that_is_none_is_refused_with_what_would_be_one(text: str, told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        prepare_target(text)
 
 
-def test_a_viewer_that_listens_is_accepted() -> None:
+def test_a_viewer_is_accepted_if_it_listens(bound_port: int) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"rerun+http://127.0.0.1:{server.getsockname()[1]}/proxy"
         assert prepare_target(f"connect={url}") == url
-
-
-def test_a_viewer_that_does_not_listen_is_named(bound_port: int) -> None:
     with pytest.raises(PeerError, match=f"no Rerun viewer listens at .*:{bound_port}/proxy"):
         prepare_target(f"connect=rerun+http://127.0.0.1:{bound_port}/proxy")
 
