@@ -2,10 +2,7 @@
 
 import json
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,49 +11,30 @@ import pytest
 from faults.props import Transmitter
 from faults.stage import ORDERLY, staged
 from helpers.status import printed_by, status_of
-from mavbridge.core.processes import free_port
+from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
 from policy.data.flight_folders import leave_out_failed, read_flight
 
 pytestmark = pytest.mark.system
 
-TIMEOUT_S = 180.0
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--engage-channel", "7")
 PITCH_CHANNEL, FORWARD_US, SWITCH = 2, 1300, 7
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
 
 
-@contextmanager
-def vehicle(folder: Path, port: int, *flags: str) -> Iterator[None]:
-    """The simulated vehicle; at the end it writes ``fc.json`` into the folder."""
-    command = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}"]
-    command += ["--camera", f"shm:record-{port}", "--image-size", "64"]
-    command += ["--report", str(folder / "fc.json"), *flags]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    try:
-        yield
-        process.send_signal(signal.SIGINT)
-        assert process.wait(TIMEOUT_S) == 0
-    finally:
-        process.kill()
-        process.wait(TIMEOUT_S)
-
-
-def recorded(out: Path, port: int, *flags: str) -> str:
-    """Record; what the command printed."""
-    link = ("--connect", f"udp:127.0.0.1:{port}", "--camera", f"shm:record-{port}")
-    status, printed = printed_by("record", "--out", str(out), *link, *flags)
-    assert status == 0, printed
-    return printed
-
-
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the expert's flight over a course, and the vehicle's own report of it."""
-    folder = tmp_path_factory.mktemp("pilot")
-    port = free_port()
-    with vehicle(folder, port, "--course", "5", "--pilot", "expert", "--pilot-speed", "6"):
-        printed = recorded(folder / "flights", port, "--on-arm", "--episodes", "1")
+    folder, port = tmp_path_factory.mktemp("pilot"), free_port()
+    camera = ("--camera", f"shm:record-{port}")
+    sitl = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}", *camera]
+    sitl += ["--image-size", "64", "--report", str(folder / "fc.json")]
+    sitl += ["--course", "5", "--pilot", "expert", "--pilot-speed", "6"]
+    link = ("--connect", f"udp:127.0.0.1:{port}", *camera)
+    with running(*sitl, log=folder / "sitl.log"):
+        flags = ("--out", str(folder / "flights"), "--on-arm", "--episodes", "1")
+        status, printed = printed_by("record", *link, *flags)
+    assert status == 0, printed
     assert "episode 1 begins (armed)" in printed
     assert "ended by disarmed, not marked" in printed
     return folder
