@@ -61,12 +61,13 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
 class _Budget(TorchFunctionMode):
     """Raises PolicyError where a network asks for more numbers than its file has.
 
-    A header of a few bytes may ask for any size, and for any number of layers. The meta device
-    could tell, too, but torch imports its compiler for it, in 2 s.
+    A header of a few bytes may ask for any size, and for any number of layers. Building it on the
+    meta device first would tell as well, but takes 2 s: torch imports its compiler for that.
     """
 
-    def __init__(self, state: Mapping[str, Tensor]) -> None:
+    def __init__(self, state: Mapping[str, Tensor], advice: str) -> None:
         super().__init__()
+        self._advice = advice
         self._file_has = sum(value.numel() for value in state.values())
         self._left = _SPARE + 2 * self._file_has + 2 * _LEAST * len(state)
 
@@ -78,7 +79,7 @@ class _Budget(TorchFunctionMode):
             self._left -= max(_LEAST, math.prod(sizes))
             if self._left < 0:
                 raise PolicyError(
-                    f"asks for a far larger network than its {self._file_has} weights"
+                    f"its {self._file_has} numbers are far too few for this network. {self._advice}"
                 )
         return func(*args, **(kwargs or {}))
 
@@ -91,7 +92,7 @@ def load_fitting(
     Batch counts may be missing: only training uses them.
     """
     try:
-        with _Budget(state):
+        with _Budget(state, advice):
             net = build()
     except _UNBUILDABLE as error:
         raise CheckpointError(f"{path}: {error}") from error
