@@ -58,6 +58,7 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
         (MIDDLE, {"on_fault": "hold"}, "BRAKE"),
         (MIDDLE, {"on_fault": "land"}, "LAND"),
         (MIDDLE, {"on_fault": "rtl"}, "RTL"),
+        (MIDDLE, {"on_fault": "release"}, None),
         (NO_RECEIVER, {"on_fault": "release"}, "BRAKE"),
         (IDLE_RECEIVER, {"on_fault": "release"}, "BRAKE"),
         (altered(MIDDLE, is_receiver_sick=True), {"on_fault": "release"}, "BRAKE"),
@@ -90,6 +91,7 @@ def test_the_mode_of_the_way_out(facts: Any, rules: Any, mode: str | None) -> No
     stepped = flying(facts, **rules)
     move = stepped.step("release") if "then" in rules else stepped.step(**FAULT)
     assert move == Actions(control=NEUTRAL, mode=mode)
+    assert mode is not None or stepped.engagement.refusal is None
 
 
 @pytest.mark.parametrize(
