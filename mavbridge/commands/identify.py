@@ -26,18 +26,13 @@ from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
 from policy.contract import RATE, ActionKind, Contract, FloatArray
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
-from policy.motion.controllers import (
-    Axis,
-    DoubletStep,
-    doublet_length_s,
-    doublet_steps,
-    measure,
-)
+from policy.motion.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps, measure
 from policy.motion.scripted import ScriptedPolicy
 from policy.motion.stick_loop import motion_of_sticks
 from policy.protocol import PolicyRunner
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Sides = tuple[float, float]
 """Value for the positive side, value for the negative side."""
 Motion = Literal["lean", "rate", "speed"]
@@ -57,8 +52,9 @@ LAGS_S = np.geomspace(0.01, 1.5, 73)
 STRIDE = 2
 """Stride of the first search; a second one looks at the neighbours of its result."""
 OUTLIER_MADS, LEAST_R_SQUARED = 6.0, 0.7
-STEADY = 0.1
-"""An action is steady if it varies by at most this share of itself."""
+STEADY, RESTED = 0.1, np.array([0.01, 0.1])
+"""Most change at the end of a push, in shares of the value: of a steady action, and of a motion at
+rest, in the first and in the second push. The first tells a limited rate from a slow lag."""
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
 """Time by which a push ends early because of the smoothing's lag; time used before a push, and at
 the end of a pause; longest gap in sends of a flying policy; time for the climb before the
@@ -221,7 +217,11 @@ def _fit_push(
     late = [(at_s >= last_s - step.half_s / 4) & (at_s < last_s) for last_s in ends_s]
     is_steady = all(np.ptp(pushed[each]) <= STEADY * abs(pushed[each].mean()) for each in late)
     settled = late[0] | late[1] if is_steady else np.full(len(at_s), True)
-    fit = _fit_response(held, moved, settled) if np.ptp(moved) > 0.0 else None
+    known = _rested_gains(pushed, moved, late) if is_steady else None
+    if known is not None:  # the first push began at rest, and shows dead time and lag
+        count = int(np.searchsorted(at_s, ends_s[0]))
+        held, moved, settled = held[: LEAD + count], moved[:count], settled[:count]
+    fit = _fit_response(held, moved, settled, known) if np.ptp(moved) > 0.0 else None
     if fit is None or fit.r_squared < LEAST_R_SQUARED:
         return "the motion does not follow the action"
     trained = [_trained_motion(contract, channel, amount) for amount in (up, down)]
@@ -260,12 +260,19 @@ class _Response(NamedTuple):
     r_squared: float
 
 
-def _fit_response(held: Array, moved: Array, settled: NDArray[np.bool_]) -> _Response:
+def _rested_gains(pushed: Array, moved: Array, late: list[Mask]) -> Array | None:
+    """Return the gain of each push from its end; None if the motion does not rest there."""
+    medians = [[np.median(half) for half in np.array_split(moved[end], 2)] for end in late]
+    earlier, later = np.array(medians).T
+    is_at_rest = np.all(np.abs(later - earlier) <= RESTED * np.abs(later))
+    return later / [pushed[end].mean() for end in late] if is_at_rest else None
+
+
+def _fit_response(held: Array, moved: Array, settled: Mask, known: Array | None) -> _Response:
     """Fit ``moved = gain * lag(held, dead time earlier)``, with a gain for each sign.
 
-    The gains are those of the samples ``settled``: where acceleration is limited, all of them
-    would give 10 % less for a full yaw rate, and 14 % for a full climb (bundled ArduPilot). Samples
-    far off the first fit, such as those of a gust, are left out of a second one.
+    Gains not known are those of the samples ``settled``: all would give 10 % less for a full yaw
+    rate, 14 % for a full climb (bundled ArduPilot). A second fit leaves outliers out.
     """
     signs = np.stack([np.maximum(held, 0.0), np.minimum(held, 0.0)], axis=-1)
     share = (1.0 - np.exp(-STEP_S / LAGS_S))[:, None]
@@ -276,7 +283,7 @@ def _fit_response(held: Array, moved: Array, settled: NDArray[np.bool_]) -> _Res
     def missed(dead: int, lag: int) -> tuple[Array, Array]:
         """Return what a fit does not explain, and its gains."""
         sides, told = lagged[LEAD - dead : len(lagged) - dead, lag], settled & kept
-        gains = np.linalg.lstsq(sides[told], moved[told], rcond=None)[0]
+        gains = np.linalg.lstsq(sides[told], moved[told], rcond=None)[0] if known is None else known
         return moved - sides @ gains, gains
 
     kept = np.full(len(moved), True)
