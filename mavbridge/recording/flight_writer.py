@@ -192,10 +192,10 @@ class FlightWriter:
             table.flush()
 
     @property
-    def images_failure(self) -> str | None:
-        """Why images are missing although the rest is recorded; None: no known reason."""
-        reasons = (self.video_failure, *(camera.video.misfit for camera in self._cameras))
-        return next((str(reason) for reason in reasons if reason), None)
+    def misfit(self) -> str | None:
+        """Why a frame was dropped that its video cannot have; None if there was none."""
+        misfits = (camera.video.misfit for camera in self._cameras)
+        return next((misfit for misfit in misfits if misfit), None)
 
     @property
     def frames_written(self) -> int:

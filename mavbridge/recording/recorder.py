@@ -97,11 +97,12 @@ class Recorder(ObserverThread):
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
         writer = self._flight.writer
-        failure = self.failure or writer.images_failure
+        failure = self.failure or writer.video_failure
         if failure is None and not self.dropped:
             counted = f"{writer.ticks} ticks and {writer.frames_written} frames"
             return f"recorded {counted} in {self._folder}"
-        lacks = failure or f"{self.dropped} events were dropped, since the machine was too busy"
+        why = f"; {writer.misfit}" if writer.misfit else ", since the machine was too busy"
+        lacks = failure or f"{self.dropped} events were dropped{why}"
         return f"recorded in {self._folder}, not completely: {lacks}"
 
 
@@ -141,10 +142,12 @@ class _FlightConsumer:
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1
-        told = self.writer.images_failure
+        told = self.writer.video_failure, self.writer.misfit
         self.writer.frame(vision)
-        failure = self.writer.images_failure
-        if failure not in (None, told):
+        failure, misfit = self.writer.video_failure, self.writer.misfit
+        if misfit not in (None, told[1]):
+            self.report(f"images are missing from the recording: {misfit}")
+        if failure not in (None, told[0]):
             self.report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:

@@ -73,6 +73,7 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
     ("shapes", "told", "recorded"),
     [
         ([(48, 64, 3)] * 3 + [(96, 128, 3)] * 3, "images have changed from 64x48 to 128x96", 3),
+        ([(9, 64, 3), (8, 64, 3), (3, 64, 3)] * 2, "images have changed from 64x8 to 64x3", 4),
         ([(1, 64, 3)] * 3, "images of 64x1 are too small for a video", 0),
         ([(64, 1, 3)] * 2 + [(48, 64, 3)], "images of 1x64 are too small for a video", 1),
     ],
@@ -85,10 +86,9 @@ def test_images_that_no_video_can_have_are_told_once_and_cost_themselves_alone(
         for number, shape in enumerate(shapes):
             frame = replace(make_frame(number), rgb=np.full(shape, 9, np.uint8))
             stood.recorder.emit(frame)
-    assert stood.told == [
-        f"recording no more images: the camera's {told}; the rest is still recorded"
-    ]
-    assert stood.recorder.summary().endswith(f"not completely: the camera's {told}")
+    assert stood.told == [f"images are missing from the recording: the camera's {told}"]
+    lost = f"{len(shapes) - recorded} events were dropped; the camera's {told}"
+    assert stood.recorder.summary().endswith(f"not completely: {lost}")
     meta = open_flight(tmp_path).meta
     assert (meta.finished, meta.ticks, meta.frames) == (True, 10, recorded)
 
