@@ -300,10 +300,15 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return _switch_off(m)
     if not now.status.armed and not is_preparing:
         return because(Code.DISARMED)
-    if (reason := _failsafe(m, now, keeps_mode=False)) is not None:
-        return reason
+    changed = None
     if m.own_mode is not None and not _is_mode_ours(m, now):
-        return because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
+        changed = because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
+    # The flag of a failsafe that kept our mode stays up, and does not tell who changes the mode.
+    codes = m.reason.codes if m.phase in (LEAVING, HOLDING) and m.reason is not None else ()
+    is_told = changed is not None and Code.FAILSAFE in codes
+    failsafe = None if is_told else _failsafe(m, now, keeps_mode=False)
+    if (reason := failsafe or changed) is not None:
+        return reason
     return because(Code.DISARMED) if is_preparing and m.was_armed and not now.status.armed else None
 
 

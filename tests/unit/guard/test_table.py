@@ -376,6 +376,9 @@ CASES = {
         why=Code.MODE_CHANGED),
     "the failsafe lasts while holding": Case(lambda: after(holding, 9.0, **KEPT), {}, HOLDING,
         NEUTRAL),
+    "the pilot's mode after a failsafe that kept ours": Case(lambda: after(lambda: after(partial(
+        flying, **LANDS), 0.01, **KEPT), 0.04, mode="RTL"), {"mode": "LOITER"}, RELEASING, RELEASE,
+        why=Code.MODE_CHANGED),
     "failsafe's mode while holding": Case(holding, {**KEPT, "mode": "LAND"}, RELEASING, RELEASE,
         why=Code.FAILSAFE),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
