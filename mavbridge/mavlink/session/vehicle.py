@@ -81,7 +81,7 @@ class TextJoiner:
     """Joins the pieces of one text as they arrive; a missing piece becomes dots."""
 
     def __init__(self) -> None:
-        self._text_id = self._ended_id = 0
+        self._text_id = self._whole_id = 0
         self._pieces: list[str] = []
         self._since_ns = 0
 
@@ -89,7 +89,7 @@ class TextJoiner:
         """Add a piece; return the texts that are complete, or will not become so."""
         if body.text_id == 0:
             return [body.text.rstrip()]
-        if body.text_id == self._ended_id:  # a piece that came twice, or too late
+        if body.text_id == self._whole_id:  # a piece that came twice
             return []
         texts = [] if body.text_id == self._text_id else self._end()
         if not self._pieces:
@@ -105,8 +105,9 @@ class TextJoiner:
         return self._end() if now_ns - self._since_ns > _WAIT_NS else []
 
     def _end(self, *, is_whole: bool = False) -> list[str]:
-        text = "".join(self._pieces)
-        self._pieces, self._ended_id = [], self._text_id
+        text, self._pieces = "".join(self._pieces), []
+        if is_whole:
+            self._whole_id = self._text_id
         return [(text if is_whole else text + _GAP).rstrip()] if text else []
 
 

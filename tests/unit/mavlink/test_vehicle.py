@@ -541,3 +541,4 @@ def test_pieces_make_a_text_and_a_lost_one_is_waited_for_and_then_shows() -> Non
     assert put(11, "one, ", 0) == joiner.step(S) == []
     assert joiner.step(S + MS) == ["one, ..."]
     assert joiner.step(10 * S) == put(11, "two, ", 1) == []
+    assert put(11, "three\t", 2) == ["...two, three"]
