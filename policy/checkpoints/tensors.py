@@ -161,7 +161,8 @@ def find_weights(path: Path, loaded: Mapping[Any, Any]) -> dict[str, Tensor]:
     tables = [
         key
         for key, table in loaded.items()
-        if isinstance(table, Mapping) and any(isinstance(each, Tensor) for each in table.values())
+        if isinstance(table, Mapping)
+        and any(isinstance(each, Tensor) and each.is_floating_point() for each in table.values())
     ]
     if len(tables) > 1:
         raise CheckpointError(
@@ -175,8 +176,8 @@ def find_weights(path: Path, loaded: Mapping[Any, Any]) -> dict[str, Tensor]:
             for name, value in found.items()
             if isinstance(name, str) and isinstance(value, Tensor)
         }
-        # Of data-parallel and compiled networks.
-        for prefix in ("module.", "_orig_mod."):
+        # Of data-parallel and compiled networks, in either order.
+        for prefix in ("module.", "_orig_mod.", "module."):
             consume_prefix_in_state_dict_if_present(weights, prefix)
         if weights:
             return weights

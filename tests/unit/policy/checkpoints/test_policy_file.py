@@ -193,7 +193,8 @@ def behind(prefix: str, state: State) -> State:
         lambda s: s,
         lambda s: behind("module.", s),
         lambda s: {"epoch": 3, "state_dict": behind("_orig_mod.", s), "optimizer": {"state": {}}},
-        lambda s: {"model_state_dict": s, "loss": 0.1},
+        lambda s: behind("_orig_mod.module.", s),
+        lambda s: {"model_state_dict": s, "rng_state": {"torch": torch.get_rng_state()}},
     ],
 )
 def test_state_dicts_load_bare_and_as_training_loops_save_them(small_toge, tmp_path, wrap):
