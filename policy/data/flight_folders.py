@@ -83,24 +83,23 @@ def failure_of(folder: Path) -> str | None:
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """Return the flights to learn from, and a line with the exclusions and their reasons."""
-    if include_failed:
-        return list(folders), None
+    """Return the flights to learn from, and a line with the exclusions and their reasons.
+
+    Empty flights are left out in any case.
+    """
     failures = {folder: failure_of(folder) for folder in folders}
-    exemplary = [folder for folder in folders if failures[folder] is None]
-    counts = Counter(why for why in failures.values() if why is not None)
+    excluded = {why for why in failures.values() if why and not include_failed} | {"empty"}
+    exemplary = [folder for folder in folders if failures[folder] not in excluded]
+    counts = Counter(why for why in failures.values() if why in excluded)
     if not counts:
         return exemplary, None
     failed = counts.total()
     why = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
+    is_empty = set(counts) == {"empty"}
+    advice = "nothing was flown" if is_empty else "--include-failed takes in all but empty ones"
     if not exemplary:
-        raise DatasetError(
-            f"all {failed} flights have failed ({why}): --include-failed takes them all the same"
-        )
-    return exemplary, (
-        f"left out: {failed} of {len(folders)} flights that failed ({why}); --include-failed takes "
-        "them in"
-    )
+        raise DatasetError(f"all {failed} flights have failed ({why}): {advice}")
+    return exemplary, f"left out: {failed} of {len(folders)} flights that failed ({why}): {advice}"
 
 
 def read_flight(folder: Path) -> FlightData:

@@ -141,6 +141,12 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
     assert leave_out_failed([], include_failed=False) == ([], None)
     with pytest.raises(DatasetError, match="all 1 flights have failed"):
         leave_out_failed([tmp_path / "b"], include_failed=False)
+    write_meta(tmp_path / "c", ticks=0)
+    kept, note = leave_out_failed(folders, include_failed=True)
+    assert kept == [folder for folder in folders if folder.name != "c"]
+    assert note == "left out: 1 of 5 flights that failed (1 empty): nothing was flown"
+    with pytest.raises(DatasetError, match="nothing was flown"):
+        leave_out_failed([tmp_path / "c"], include_failed=True)
 
 
 def test_no_flights_are_refused(tmp_path: Path) -> None:
