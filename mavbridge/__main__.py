@@ -24,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from mavbridge.core.provenance import without_secrets
     from mavbridge.core.stopping import end_process, interrupt_once
 
+    end = partial(end_process, must_exit=arguments is None)
     if arguments is None:
         interrupt_once()
     try:
@@ -36,12 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             survive_lost_readers()
         status = cli.meta(arguments)
     except KeyboardInterrupt:
-        end_process(128 + signal.SIGINT)
+        end(128 + signal.SIGINT)
     except MavbridgeError as error:
         message = f"[bold red]error:[/] {escape(without_secrets(str(error)))}"
         console = SafeConsole(stderr=True, highlight=False, emoji=False)
-        end_process(error.exit_code, partial(console.print, message, soft_wrap=True))
-    end_process(status or 0)
+        end(error.exit_code, partial(console.print, message, soft_wrap=True))
+    end(status or 0)
 
 
 if __name__ == "__main__":

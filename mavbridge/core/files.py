@@ -82,6 +82,7 @@ def write_durably(path: Path, text: str) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}")
+    temporary.unlink(missing_ok=True)  # left by a loss of power, or a stranger's link
     try:
         with temporary.open("x", encoding="utf-8") as file:
             file.write(text)

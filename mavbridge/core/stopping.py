@@ -20,6 +20,8 @@ ONE_REQUEST_NS = 250 * NS_PER_MS
 parent program may pass on a Ctrl-C that the terminal has sent to both."""
 LAST_WORDS_S = 1.0
 """Longest wait for the console to take the last output before the process exits."""
+EXIT_S = 5.0
+"""Longest wait for exit handlers, and for threads and pools that a policy has left."""
 
 
 class StopRequest:
@@ -123,13 +125,15 @@ def interrupt_once(clock: Clock | None = None) -> None:
     signal.signal(signal.SIGINT, interrupt)
 
 
-def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
+def end_process(
+    status: int, say: Callable[[], None] | None = None, *, must_exit: bool = True
+) -> NoReturn:
     """Exit with ``status`` after calling ``say``, without blocking on the console.
 
     An ordinary exit flushes standard output and error, and blocks for ever if another thread sleeps
     in a write to them or their reader has stalled. Here the flush is tried for ``LAST_WORDS_S``; if
-    it does not succeed, the process exits at once, without exit handlers. It would also wait for
-    threads of a policy, which get ``LAST_WORDS_S``.
+    it does not succeed, the process exits at once, without exit handlers. An ordinary exit would
+    also wait for threads of a policy: with ``must_exit``, the process ends after ``EXIT_S``.
     """
 
     def finish(_stop: threading.Event) -> None:
@@ -139,8 +143,7 @@ def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
             stream.flush()
 
     def end_late(stop: threading.Event) -> None:
-        threading.main_thread().join()  # it ends first, then the interpreter waits for the others
-        stop.wait(LAST_WORDS_S)
+        stop.wait(EXIT_S)
         os._exit(status)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would cut the last words short
@@ -148,6 +151,6 @@ def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
     last_words.start()
     if not last_words.ends_within(LAST_WORDS_S):
         os._exit(status)
-    if any(not one.daemon for one in threading.enumerate() if one is not threading.main_thread()):
+    if must_exit:
         Worker("mavbridge-late-end", end_late).start()
     sys.exit(status)

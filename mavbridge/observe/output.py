@@ -6,7 +6,7 @@ import os
 import select
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO, cast
 
@@ -145,10 +145,9 @@ class _Lines(io.TextIOBase):
             self._show(line)
         return len(text)
 
-    def close(self) -> None:
-        """Pass on an unfinished last line."""
+    def finish(self) -> None:
+        """Pass on an unfinished last line. A policy may have kept the stream and print later."""
         self.write("\n")
-        super().close()
 
 
 @contextmanager
@@ -160,11 +159,14 @@ def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
     """
     old_out, old_err = sys.stdout, sys.stderr
     is_console = old_out is not None and not old_out.closed and old_out.isatty()
-    with ExitStack() as stack:
-        sys.stderr = stack.enter_context(closing(_Lines(show, old_err)))
-        if is_console:
-            sys.stdout = stack.enter_context(closing(_Lines(show, old_out)))
-        try:
-            yield
-        finally:
-            sys.stdout, sys.stderr = old_out, old_err
+    shown = [_Lines(show, old_err)]
+    sys.stderr = shown[0]
+    if is_console:
+        shown.append(_Lines(show, old_out))
+        sys.stdout = shown[1]
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = old_out, old_err
+        for lines in shown:
+            lines.finish()

@@ -19,6 +19,7 @@ pytestmark = pytest.mark.system
 POLICY = """
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from policy.contract import Contract
 
@@ -34,6 +35,10 @@ class Untidy(Single):
     def __init__(self):
         os.chdir("/")
         threading.Thread(target=threading.Event().wait).start()
+
+    def predict(self, image, state, history, steps):
+        ThreadPoolExecutor().submit(threading.Event().wait)
+        return super().predict(image, state, history, steps)
 
 
 class Hanging(Single):

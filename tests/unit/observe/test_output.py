@@ -53,6 +53,9 @@ def test_what_anybody_prints_becomes_messages(monkeypatch: pytest.MonkeyPatch) -
         sys.stderr.write("o\r\n" + 3000 * "x")
         print("to a file")
         sys.stderr.write("its last words")
+        kept = sys.stderr
+    print("afterwards", file=kept, flush=True)
+    assert shown.pop() == "afterwards"
     assert shown == ["one", "two", 3000 * "x", "its last words"]
     assert sys.stderr is errors
     assert out.getvalue() == "to a file\n"
