@@ -88,7 +88,7 @@ def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s,
     assert clock.now_ns() == START_NS + round(timeout_s * NS_PER_S)
     said = [line.partition(" (") for line in lines]
     assert [line for line, _, _ in said] == [f"waiting for the camera: {s} s left" for s in left_s]
-    assert ["python -m sitl --camera shm:mb-none" in reason for _, _, reason in said] == [
+    assert ["--camera shm:mb-none" in reason for _, _, reason in said] == [
         second == 2 for second in left_s
     ], "a reason is told once"
 

@@ -158,7 +158,7 @@ def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
 
 
 def test_a_fork_of_the_policy_does_not_keep_the_writer(tmp_path: Path) -> None:
-    video = VideoWriter(tmp_path / "camera.mp4", pressure="online", hz=30)
+    video = VideoWriter(VideoJob(tmp_path / "camera.mp4", hz=30), pressure="online")
     child = os.fork()
     if child == 0:
         signal.pause()
