@@ -27,9 +27,10 @@ def user_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(autouse=True)
-def _ctrl_c_is_heard() -> Iterator[None]:
-    """As a person at a terminal has it: shells start programs in the background without it, their
-    children inherit that, and a test may leave it so."""
+def _signals_are_heard() -> Iterator[None]:
+    """As a person at a terminal has them: shells start programs in the background without Ctrl-C,
+    nohup without SIGHUP, their children inherit that, and a test may leave it so."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, signal.default_int_handler)
