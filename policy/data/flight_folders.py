@@ -29,9 +29,10 @@ from policy.motion.stick_loop import StickLoop, rates_contract
 FORMAT, VERSION = "mavbridge-flight", 1
 VIDEO = "camera.mp4"
 
+_AGE_COLUMNS = ("woke_ns", "chunk_computed_ns", "predict_ns", "feature_captured_ns")
 _TICK_COLUMNS = (
-    *("woke_ns", "sent_ns", "feature_captured_ns", "state", "attitude_ns", "velocity_ns"),
-    *("chunk_computed_ns", "predict_ns", "sent", "rc_sticks", "armed", "phase", "mode"),
+    *(*_AGE_COLUMNS, "sent_ns", "state", "attitude_ns", "velocity_ns"),
+    *("sent", "rc_sticks", "armed", "phase", "mode"),
 )
 _FRAME_COLUMNS = ("captured_ns",)
 
@@ -216,7 +217,7 @@ def _corrections(
 def read_ages(folder: Path) -> Nanoseconds:
     """Return the sorted image ages that were measured at the decisions of a flight."""
     _read_meta(folder)
-    ages = _ages(str(folder), _read_table(folder, "ticks", _TICK_COLUMNS, [])[0])
+    ages = _ages(str(folder), _read_table(folder, "ticks", _AGE_COLUMNS, [])[0])
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
