@@ -277,8 +277,9 @@ def _is_mode_ours(m: Memory, now: EngagementInputs) -> bool:
 
 
 def _failsafe(m: Memory, now: EngagementInputs, *, keeps_mode: bool) -> Reason | None:
-    """Return the reason if an armed vehicle is in a failsafe that keeps our mode; False: any other.
+    """Return the reason if an armed vehicle is in a failsafe that keeps our mode, or in another.
 
+    ``keeps_mode`` tells which of the two is asked for; None if the vehicle is not in such a one.
     ArduPilot reports a failsafe together with the mode that it sets. PX4 may report it earlier, so
     that our mode tells nothing there.
     """
