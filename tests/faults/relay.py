@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from faults.link import LOOPBACK, Carrier, FaultyLink, LinkFaults
 from faults.props import Worker
 from faults.record import DITHER_US, NEUTRAL_US
-from sitl.clock import NS_PER_S, Clock
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 
 Message = Any  # a pymavlink message (the library has no types)
 FOREVER_NS = 1 << 62
@@ -165,6 +165,9 @@ class Relay(Worker):
         self.has_flown = threading.Event()
         self.has_heard = threading.Event()
         """Set once the vehicle has sent something, so that its address is known."""
+        self.longest_silence_ms = 0.0
+        """Longest time in flight without a packet of the vehicle, before any fault of the link."""
+        self._heard_ns = 0
         self.port: int = self._socket.getsockname()[1]
 
     def __exit__(self, *_: object) -> None:
@@ -284,6 +287,10 @@ class Relay(Worker):
             data, self._vehicle = self._socket.recvfrom(65536)
         except (BlockingIOError, ConnectionError):
             return
+        if self.has_flown.is_set():
+            silence_ms = (now_ns - self._heard_ns) / NS_PER_MS
+            self.longest_silence_ms = max(self.longest_silence_ms, silence_ms)
+        self._heard_ns = now_ns
         self.has_heard.set()
         if data := self._rewritten(data):
             self._to_bridge.pass_on(data, now_ns)

@@ -38,7 +38,7 @@ def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0)
                 _fly_once(scenario, verdict, Path(name), slack_ms)
             except (StageError, NoVerdictError) as error:
                 verdict.late.append(str(error))
-            verdict.stall_ms = stalls.longest_ms
+            verdict.stall_ms = max(verdict.stall_ms, stalls.longest_ms)
         if verdict.passed or verdict.stall_ms <= MOST_STALL_MS:
             break
     return verdict
@@ -70,6 +70,7 @@ def _fly_once(scenario: Scenario, verdict: Verdict, folder: Path, slack_ms: floa
             _perform(scenario, stage)
             stage.kill_group(signal.SIGINT)
         verdict.exit, verdict.output = stage.end()
+    verdict.stall_ms = stage.relay.longest_silence_ms
     judge(verdict, scenario, stage, at_ns, leans, slack_ms)
     left = leaks(stage.processes, stage.memory, stage.temporary, threads)
     verdict.late += [f"it left {rest}" for rest in left]
