@@ -63,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     # An exit by this signal also ends the processes of the current flight.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    # A shell starts programs in the background without Ctrl-C, and the bridge would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return _soak(args.soak) if args.soak else _fly_catalogue(args)
     except (UsageError, StageError) as error:
