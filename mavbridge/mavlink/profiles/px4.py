@@ -330,8 +330,8 @@ def _lean(tilt_deg: float, *, is_tangent: bool) -> Lean:
 
 def _stick_notes(values: Mapping[str, float], version: str | None) -> Iterator[ParamNote]:
     """Yield what refuses, weakens or changes sticks, and gestures a policy might make."""
-    # A build without tags is 0.0.0.
-    if version and [1] <= [int(part) for part in version.split(".")] < [1, 16]:
+    # 1.13 showed it as it was sent; a build without tags is 0.0.0.
+    if version and [1, 14] <= [int(part) for part in version.split(".")] < [1, 16]:
         effect = "shows the throttle as -1000 to 1000, so that our sticks cannot be checked"
         cure = "update it to 1.16 or later, or fly by setpoints"
         yield ParamNote("obstacle", (), f"PX4 {version} {effect}: {cure}")
