@@ -105,9 +105,9 @@ class TextJoiner:
         return self._end() if now_ns - self._since_ns > _WAIT_NS else []
 
     def _end(self, *, is_whole: bool = False) -> list[str]:
-        text, self._pieces = "".join(self._pieces), []
-        if is_whole:
+        if is_whole and _GAP not in self._pieces:
             self._whole_id = self._text_id
+        text, self._pieces = "".join(self._pieces), []
         return [(text if is_whole else text + _GAP).rstrip()] if text else []
 
 

@@ -277,7 +277,10 @@ def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
 
 @pytest.mark.parametrize(
     ("version", "code"),
-    [("1.15.4", Code.OBSTACLE), *((v, None) for v in ("1.16.0", "1.18.0", "0.0.0"))],
+    [
+        *((v, Code.OBSTACLE) for v in ("1.14.0", "1.15.4")),
+        *((v, None) for v in ("1.13.3", "1.16.0", "1.18.0", "0.0.0")),
+    ],
 )
 def test_sticks_need_a_px4_that_shows_the_throttle_as_it_was_sent(
     version: str, code: Code | None
@@ -537,6 +540,7 @@ def test_pieces_make_a_text_and_a_lost_one_is_waited_for_and_then_shows() -> Non
     assert put(7, "three\t", 2) == ["one, two, three"]
     assert put(7, "three\t", 2) == put(7, "one, ", 0) == []
     assert (put(8, "one, ", 0), put(8, "three\t", 2)) == ([], ["one, ...three"])
+    assert (put(8, "two, ", 1), joiner.step(2 * S)) == ([], ["...two, ..."])
     assert (put(9, "one, ", 0), put(10, "next", 0)) == ([], ["one, ...", "next"])
     assert put(11, "one, ", 0) == joiner.step(S) == []
     assert joiner.step(S + MS) == ["one, ..."]
