@@ -56,6 +56,9 @@ class Code(StrEnum):
         "the engage switch (channel {channel}) did not rest low for {rest_s:g} s with a receiver "
         "that works: leave it low for 2 s, then switch it on"
     )
+    ARMED_UNSEEN = _waiting(
+        "the vehicle was armed before it was found, or while it was silent: press e"
+    )
     NOT_ARMED = _waiting("the vehicle is disarmed; arm it first, or use --arm")
     WRONG_MODE = _waiting(
         "the policy may not fly in {mode}, only in {allowed}: change the mode, or use --mode"

@@ -181,6 +181,8 @@ class VehicleStatus:
     armed: bool
     mode_arrived_ns: int | None = None
     """Arrival of the newest message that reports the mode."""
+    armed_arrived_ns: int | None = None
+    """Arrival of the newest message that reports ``armed``: HEARTBEAT or an EVENT."""
     rc_sticks: Sticks | None = None
     """Sticks that the vehicle acts on (RC_CHANNELS through its calibration); None if stale."""
     rc_channels_us: tuple[int, ...] = ()

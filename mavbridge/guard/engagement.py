@@ -166,11 +166,26 @@ class Engagement(Memory):
 
     def _note_act(self, now: EngagementInputs, act: OperatorCommand | None) -> None:
         """Note this step's act: the operator's command, the engage switch or the first arming."""
-        is_first_arming = now.status.armed and self.is_arming_awaited is True
-        if now.link.status is not None and self.is_arming_awaited is not False:
-            self.is_arming_awaited = not now.status.armed
-        is_act = self._is_switched_on(now) or (is_first_arming and self.settings.engage_on_arm)
+        is_armed_first = self._is_armed_first(now) and self.settings.engage_on_arm
+        is_act = self._is_switched_on(now) or is_armed_first
         self.act = act or ("engage" if is_act else None)
+
+    def _is_armed_first(self, now: EngagementInputs) -> bool:
+        """True if a vehicle that was seen disarmed is seen armed for the first time.
+
+        An arming during a silence is no act: the return of a link must not engage.
+        """
+        told_ns = now.now_ns if now.status.armed_arrived_ns is None else now.status.armed_arrived_ns
+        oldest_ns = max(self.news_from_ns, now.now_ns - ACT_TIMEOUT_NS)
+        was_awaited = self.is_arming_awaited
+        if now.link.status is None or told_ns <= oldest_ns:
+            self.is_arming_awaited = None if was_awaited else was_awaited
+            return False
+        if was_awaited is not False:
+            self.is_arming_awaited = not now.status.armed
+        if now.status.armed and was_awaited is None and self.settings.engage_on_arm:
+            self.refusal = not_engaged(because(Code.ARMED_UNSEEN))
+        return now.status.armed and was_awaited is True
 
     def _is_switched_on(self, now: EngagementInputs) -> bool:
         """True if a hand has put the engage switch high.

@@ -83,7 +83,8 @@ class Memory:
     heard_ns: int = 0
     """Last time at which the mode was known; reset when LEAVING begins."""
     is_arming_awaited: bool | None = None
-    """True until the vehicle is armed for the first time; None before it is found."""
+    """True until the vehicle is armed for the first time; None until it is seen disarmed or armed,
+    at first and after a silence."""
     switch: Switch = field(default_factory=lambda: Switch(rest_ns=REST_NS))
 
     @property

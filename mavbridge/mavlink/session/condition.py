@@ -50,6 +50,7 @@ class VehicleCondition:
         self._custom_mode = 0
         self._mode_ns: int | None = None
         self._is_armed = False
+        self._armed_ns: int | None = None
         self._is_failsafe = False
         self._changed_ns: int | None = None
         """Last change that CURRENT_MODE or an EVENT reported."""
@@ -96,7 +97,7 @@ class VehicleCondition:
         changed_ns = self._changed_ns
         if changed_ns is not None and arrived_ns - changed_ns < SETTLE_NS and not is_first:
             return
-        self._custom_mode, self._mode_ns = body.custom_mode, arrived_ns
+        self._custom_mode, self._mode_ns, self._armed_ns = body.custom_mode, arrived_ns, arrived_ns
         self._is_armed = bool(body.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         self._is_failsafe = body.system_status >= dialect.MAV_STATE_CRITICAL
 
@@ -116,7 +117,8 @@ class VehicleCondition:
         if meaning is None or self.heartbeat is None:
             return
         if meaning.is_armed is not None:
-            self._is_armed, self._changed_ns = meaning.is_armed, arrived_ns
+            self._is_armed = meaning.is_armed
+            self._armed_ns = self._changed_ns = arrived_ns
         if meaning.is_failsafe:
             self._note_failsafe(arrived_ns)
         if meaning.is_stick_override:
@@ -204,6 +206,7 @@ class VehicleCondition:
             mode=self._profile.modes.name(self._custom_mode),
             armed=self._is_armed,
             mode_arrived_ns=self._mode_ns,
+            armed_arrived_ns=self._armed_ns,
             rc_sticks=self._rc_sticks if is_shown else None,
             rc_channels_us=rc.channels_us if is_shown else (),
             channels_arrived_ns=rc_ns,

@@ -26,6 +26,7 @@ from mavbridge.guard.values import NOT_FOUND, Actions, ControlSource, EndRequest
 
 NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
 RELEASE = Actions(control=ControlSource.RELEASE)
+UNSEEN = because(Code.ARMED_UNSEEN)
 
 
 # --- the engage switch and the first arming
@@ -128,6 +129,28 @@ def test_a_vehicle_that_is_found_armed_was_not_armed_for_us(found_ns: int) -> No
     stepped = Stepped(facts, engage_on_arm=True)
     stepped.run(found_ns / NS_PER_S)
     assert set(stepped.run(1, armed=True, mode="ALT_HOLD")) == {NOTHING}
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=UNSEEN)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "unheard"),
+    [(0.3, ("heard_ns", "mode_arrived_ns")), (2.9, ()), (3.1, ())],
+)
+@pytest.mark.parametrize("is_seen_disarmed", [True, False])
+def test_an_arming_during_a_silence_is_no_act(
+    seconds: float, unheard: tuple[str, ...], is_seen_disarmed: bool
+) -> None:
+    stepped = Stepped(ON_GROUND, engage_on_arm=True)
+    stepped.run(0.1)
+    told = dict.fromkeys(("armed_arrived_ns", *unheard), stepped.facts.now_ns)
+    stepped.run(seconds, **told)
+    stepped.run(0.05, heard_ns=None, mode_arrived_ns=None)  # CURRENT_MODE tells of no arming
+    if is_seen_disarmed:
+        stepped.step(armed_arrived_ns=None)
+    is_act = is_seen_disarmed or seconds == 2.9
+    assert stepped.step(armed_arrived_ns=None, armed=True) == (FLIES if is_act else NOTHING)
+    why = None if is_act else because(Code.NOT_ENGAGED_SINCE, why=UNSEEN)
+    assert stepped.engagement.refusal == why
 
 
 # --- what is remembered from one flight to the next

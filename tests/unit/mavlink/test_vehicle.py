@@ -276,6 +276,24 @@ def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
 
 
 @pytest.mark.parametrize(
+    ("body", "tells_arming"),
+    [
+        (beat(ALTCTL), True),
+        (Event(ARMED_BY), True),
+        (Event(FAILSAFE_HOLD), False),
+        (CurrentMode(POSCTL, POSCTL), False),
+    ],
+)
+def test_px4_tells_by_heartbeat_and_event_whether_it_is_armed(
+    body: Body, tells_arming: bool
+) -> None:
+    session = Session("px4")
+    session.now_ns += S
+    session.put(body)
+    assert (session.status.armed_arrived_ns == session.now_ns) is tells_arming
+
+
+@pytest.mark.parametrize(
     ("version", "code"),
     [
         *((v, Code.OBSTACLE) for v in ("1.14.0", "1.15.4")),
