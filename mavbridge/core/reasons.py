@@ -115,7 +115,7 @@ class Code(StrEnum):
         "the release was not seen: the vehicle still shows our last sticks, as it does without a "
         "receiver, or with one at rest in the same position"
     )
-    NOT_RELEASED = _vehicle("{instead} instead of release in the air: {why}")
+    NOT_RELEASED = _vehicle("{instead} instead of release: {why}")
     NO_RECEIVER = _vehicle("there is no receiver")
     RECEIVER_LOST = _vehicle("the receiver is lost")
     SILENCE_IS_FAILSAFE = _vehicle("the vehicle takes the end of our sticks for a failsafe")

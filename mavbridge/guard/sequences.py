@@ -239,9 +239,7 @@ class DisengageSequence:
         choice, note = self.settings.on_fault if is_fault else self.settings.then, None
         objection = self._hand_objection(now)
         self.may_release = objection is None
-        if choice == "release" and now.status.is_landed:
-            self.may_release = True
-        elif choice in ("auto", "release"):
+        if choice in ("auto", "release"):
             instead: OnFault = "hold" if is_fault else "land"
             if objection is not None and choice == "release":
                 note = because(Code.NOT_RELEASED, instead=instead, why=objection)

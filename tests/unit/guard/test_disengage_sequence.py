@@ -66,7 +66,8 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
         (altered(IDLE_RECEIVER, is_landed=True), {"on_fault": "auto"}, None),
         (altered(IDLE_RECEIVER, is_landed=None), {"on_fault": "auto"}, "BRAKE"),
         (altered(NO_RECEIVER, is_landed=True), {"on_fault": "auto"}, "BRAKE"),
-        (altered(NO_RECEIVER, is_landed=True), {"on_fault": "release"}, None),
+        (altered(NO_RECEIVER, is_landed=True), {"on_fault": "release"}, "BRAKE"),
+        (altered(IDLE_RECEIVER, is_landed=True), {"on_fault": "release"}, None),
         (altered(AIRBORNE, mode="LOITER"), {"is_setpoint": True, "modes": ("LOITER",)}, "BRAKE"),
         # at a normal end
         (MIDDLE, {"then": "auto"}, None),
@@ -75,6 +76,7 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
         (altered(IDLE_RECEIVER, is_landed=True), {"then": "auto"}, None),
         (NO_RECEIVER, {"then": "auto"}, "LAND"),
         (NO_RECEIVER, {"then": "release"}, "LAND"),
+        (altered(NO_RECEIVER, is_landed=True), {"then": "release"}, "LAND"),
         (MIDDLE, {"then": "rtl"}, "RTL"),
         # where sticks do nothing, as in the autopilot's takeoff
         (altered(AIRBORNE, mode="GUIDED"), {"then": "auto", "modes": ("GUIDED",)}, "BRAKE"),
