@@ -21,7 +21,9 @@ from mavbridge.mavlink.codec.messages import (
     AutopilotVersion,
     CommandAck,
     CommandRequest,
+    CurrentMode,
     Event,
+    Heartbeat,
     ParamAbsent,
     ParamValue,
     RcChannels,
@@ -33,7 +35,7 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile
 from mavbridge.mavlink.profiles.px4 import PX4
-from mavbridge.mavlink.session.condition import VehicleCondition
+from mavbridge.mavlink.session.condition import SETTLE_NS, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester
@@ -169,6 +171,8 @@ class VehicleSession:
         """Silence before the first old timestamp."""
         self._old_stamps = 0
         self._upset: tuple[int, Reason] | None = None
+        self._mode_sequence, self._mode_ns = 0, -SETTLE_NS
+        """Sequence number and arrival of the last HEARTBEAT or CURRENT_MODE."""
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: request its echo, check its demands."""
@@ -188,6 +192,8 @@ class VehicleSession:
         """Process one message from this vehicle."""
         self._streams.receive(message.name, arrived_ns)
         body = message.body
+        if isinstance(body, Heartbeat | CurrentMode) and self._is_overtaken(message, arrived_ns):
+            return
         self.condition.calibration = self.params.calibration
         self.condition.keeps_sticks = self.profile.keeps_sticks(self.params.values)
         self.condition.receive(body, arrived_ns)
@@ -209,6 +215,17 @@ class VehicleSession:
                 self._show(*self._texts.receive(body, arrived_ns))
             case Event(event_id) if (meaning := self.profile.events.get(event_id)) is not None:
                 self._show(*([meaning.text] if meaning.text else []))
+
+    def _is_overtaken(self, message: ReceivedMessage, arrived_ns: int) -> bool:
+        """True if a later report of the mode has arrived within the last 100 ms.
+
+        The old mode would look like a pilot's change back to it.
+        """
+        is_behind = (message.sequence - self._mode_sequence) % 256 > 128
+        if is_behind and arrived_ns - self._mode_ns < SETTLE_NS:
+            return True
+        self._mode_sequence, self._mode_ns = message.sequence, arrived_ns
+        return False
 
     def _show(self, *texts: str) -> None:
         for text in texts:

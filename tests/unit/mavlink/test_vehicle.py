@@ -87,8 +87,8 @@ class Session:
         if is_ready:
             self.shake_hands()
 
-    def put(self, body: Body, name: str = "ANY") -> None:
-        message = ReceivedMessage(Endpoint(1, 1), 0, name, body, b"")
+    def put(self, body: Body, name: str = "ANY", *, sequence: int = 0) -> None:
+        message = ReceivedMessage(Endpoint(1, 1), sequence, name, body, b"")
         self.output.receive(body, self.session, self.now_ns)
         self.session.receive(message, self.now_ns)
 
@@ -273,6 +273,30 @@ def test_px4_is_in_the_state_that_the_newest_of_three_messages_tells(
         status = session.status
         told = (status.mode, status.armed and "armed", status.is_failsafe and "failsafe")
         assert " ".join(filter(None, told)) == expected
+
+
+@pytest.mark.parametrize("body", [beat(LAND), CurrentMode(LAND, LAND)])
+@pytest.mark.parametrize(
+    ("sequence", "after_ms", "mode"),
+    [
+        (2, 99, "POSCTL"),
+        (132, 99, "POSCTL"),
+        (131, 99, "AUTO.LAND"),  # 128 packets later, most of them lost
+        (4, 99, "AUTO.LAND"),
+        (3, 99, "AUTO.LAND"),  # a router that does not number
+        (2, 100, "AUTO.LAND"),  # rebooted, or on another route
+    ],
+)
+def test_a_report_of_the_mode_that_was_overtaken_is_old(
+    body: Body, sequence: int, after_ms: int, mode: str
+) -> None:
+    session = Session("px4")
+    session.put(beat(POSCTL), sequence=3)
+    session.now_ns += 60 * MS
+    session.put(beat(POSCTL), sequence=3)
+    session.now_ns += after_ms * MS
+    session.put(body, sequence=sequence)
+    assert session.status.mode == mode
 
 
 @pytest.mark.parametrize(
