@@ -331,8 +331,10 @@ class DisengageSequence:
         self.must_hold = not self.settings.is_setpoint and (self.is_silence_failsafe or not is_safe)
         if unheard_ns is not None:  # the timeout starts when the vehicle is heard
             self.asks_until_ns = now.now_ns + MODE_TIMEOUT_NS
-        # No vehicle refuses to land: such an answer is a late one to the previous request.
-        if not is_confirmed and now.link.refused_mode == self.mode:
+        # A refusal before our request is an earlier flight's. No vehicle refuses to land: such an
+        # answer is a late one to the previous request.
+        has_asked = self.asked_ns is not None
+        if has_asked and not is_confirmed and now.link.refused_mode == self.mode:
             self.mode = now.link.modes.land or None
         elapsed_ns = now.now_ns - self.began_ns
         self._watch_undoing(now)

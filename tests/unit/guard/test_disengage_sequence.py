@@ -168,6 +168,8 @@ def test_a_refused_mode_becomes_land() -> None:
     assert stepped.step(mode="LAND", refused_mode=None).control is RELEASE
     late = at_fault(NO_RECEIVER).run(0.3, mode="BRAKE", refused_mode="BRAKE")
     assert {move.mode for move in late} == {None}, "it has come all the same"
+    earlier = at_fault(altered(IDLE_RECEIVER, refused_mode="BRAKE")).moves[-1]
+    assert earlier.mode == "BRAKE", "an earlier flight's refusal is over"
 
 
 @pytest.mark.parametrize("hold", ["", "BRAKE"])
