@@ -226,6 +226,10 @@ class Code(StrEnum):
         "the policy's chunks arrive up to {gap_ms:.0f} ms apart, and its age limits and horizon "
         "allow at most {bridged_ms:.0f} ms; use a higher rate"
     )
+    CHUNKS_RESUMED = _waiting(
+        "chunks have just resumed after a gap of {gap_ms:.0f} ms (limit {bridged_ms:.0f} ms): "
+        "engage again"
+    )
     NO_CHUNK = _waiting("no chunk from the policy yet")
     NOT_RECORDED = _fault("the recording lacks {what}")
     JUST_BEGUN = _waiting("the policy has only just started")

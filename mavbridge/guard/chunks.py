@@ -260,11 +260,11 @@ class ChunkBuffer:
         if len(self._gaps_ns) < LEAST_GAPS:
             return because(Code.JUST_BEGUN)
         bridged_ns = self._grace_until_ns - self._taken_ns
-        if (gap_ns := max(self._gaps_ns)) > bridged_ns:
-            is_limited = bridged_ns < self.grace_ns
+        if long_ns := [gap_ns for gap_ns in self._gaps_ns if gap_ns > bridged_ns]:
+            often = Code.CHUNKS_BEYOND_PLAN if bridged_ns < self.grace_ns else Code.CHUNKS_APART
             return because(
-                Code.CHUNKS_BEYOND_PLAN if is_limited else Code.CHUNKS_APART,
-                gap_ms=gap_ns / NS_PER_MS,
+                often if len(long_ns) > 1 else Code.CHUNKS_RESUMED,
+                gap_ms=max(long_ns) / NS_PER_MS,
                 bridged_ms=bridged_ns / NS_PER_MS,
             )
         return self._stale(chunk, now_ns)

@@ -320,6 +320,7 @@ def apart(gap_ms: int, bridged_ms: int, code: Code = Code.CHUNKS_APART) -> Reaso
     return because(code, gap_ms=gap_ms, bridged_ms=bridged_ms)
 
 
+RESUMED = apart(101, 100, Code.CHUNKS_RESUMED)
 TOO_SHORT = because(
     Code.HORIZON_TOO_SHORT, covered_ms=35, gap_ms=60, horizon_ms=40, steps=2, step_ms=20
 )
@@ -331,10 +332,11 @@ TOO_SHORT = because(
         (10, LIMITS, (), {}, because(Code.JUST_BEGUN)),
         (10, LIMITS, (10,), {}, because(Code.JUST_BEGUN)),
         (10, LIMITS, (100, 10), {}, None),  # as far apart as is bridged
-        (10, LIMITS, (101, 10), {}, apart(101, 100)),
-        (10, LIMITS, (10, 101), {}, apart(101, 100)),
+        (10, LIMITS, (101, 10), {}, RESUMED),
+        (10, LIMITS, (10, 101), {}, RESUMED),
+        (10, LIMITS, (101, 10, 102), {}, apart(102, 100)),
         (10, LIMITS, (101, *[10] * 8), {}, None),  # the eighth gap after it forgets it
-        (10, LIMITS, (101, *[10] * 7), {}, apart(101, 100)),
+        (10, LIMITS, (101, *[10] * 7), {}, RESUMED),
         (10, LIMITS, (10, 60), SHORT, None),
         (10, LIMITS, (10, 35, 35), SHORT, None),
         (10, LIMITS, (10, 60, 60), SHORT, TOO_SHORT),  # most end before the next one
