@@ -8,6 +8,7 @@ from functools import cache
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
@@ -46,7 +47,8 @@ _TEXT_CHUNKS = 4
 MOST_DATAGRAM_BYTES = 4096
 """Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
 case takes 0.7 ms; the largest UDP datagram would take 10 ms."""
-
+_MOST_PARTIALS = 16
+"""Senders whose unfinished packets are kept."""
 
 GESTURE_Z, MOST_LOW_R = 150, 800
 """PX4 arms and disarms if z < 100 and |r| > 900 for one second; both bounds include a margin."""
@@ -83,15 +85,15 @@ def _zeros(layout: struct.Struct) -> tuple[float | bytes, ...]:
 
 
 class Codec:
-    """One MAVLink 2 endpoint without I/O; owns the unfinished packet and the sending sequence."""
+    """One MAVLink 2 endpoint without I/O; owns unfinished packets and the sending sequence."""
 
     def __init__(
         self, *, source_system: int, source_component: int, signing: Signing | None = None
     ) -> None:
         self.source = Endpoint(source_system, source_component)
         self._sequence = 0
-        self._partial = b""
-        """Beginning of a packet whose end has not arrived."""
+        self._partials: dict[SocketAddress | None, bytes] = {}
+        """Beginning of a packet whose end has not arrived, by sender; None: a stream's peer."""
         self.bad_data_count = 0
         self.signing = signing
         """Signs sent packets and checks received ones; None: neither."""
@@ -115,38 +117,40 @@ class Codec:
             if self.signing is not None:
                 self.signing.link_id = LINK_ID
 
-    def forget_partial(self) -> None:
-        """Drop an unfinished packet, which the next bytes do not continue."""
-        self._partial = b""
+    def forget_partials(self) -> None:
+        """Drop the unfinished packets, which the next bytes do not continue."""
+        self._partials.clear()
 
-    def decode_datagram(self, data: bytes) -> Iterator[ReceivedMessage]:
+    def decode_datagram(
+        self, data: bytes, sender: SocketAddress | None = None
+    ) -> Iterator[ReceivedMessage]:
         """Yield the messages of one datagram, which usually holds one or several whole packets.
 
-        A marker at its start means that an unfinished earlier packet was cut off and is dropped.
-        A datagram that starts otherwise may continue a forwarded serial stream. Bytes beyond
-        ``MOST_DATAGRAM_BYTES`` are ignored.
+        It may continue its sender's forwarded serial stream. If it starts with a marker and does
+        not complete the sender's unfinished packet, that packet was cut off and is dropped. Bytes
+        beyond ``MOST_DATAGRAM_BYTES`` are ignored.
         """
         if len(data) > MOST_DATAGRAM_BYTES:
             data = data[:MOST_DATAGRAM_BYTES]
             self.bad_data_count += 1
-        if MARKER.match(data):
-            self.forget_partial()
-        elif not self._partial:
-            self.bad_data_count += 1
-            return
-        yield from self.decode(data)
+        if MARKER.match(data) and (partial := self._partials.get(sender)):
+            joined = frame_at(partial + data, 0)
+            if joined is None or not joined.is_sound:
+                del self._partials[sender]
+        yield from self.decode(data, sender)
 
-    def decode(self, data: bytes) -> Iterator[ReceivedMessage]:
+    def decode(self, data: bytes, sender: SocketAddress | None = None) -> Iterator[ReceivedMessage]:
         """Yield the messages completed by these bytes; count corrupt bytes and unusable values."""
-        data, at = self._partial + data, 0
-        self._partial = b""
+        data, at = self._partials.pop(sender, b"") + data, 0
         while at < len(data):
             if (frame := frame_at(data, at)) is not None:
                 at += len(frame.data)
                 if (message := self._decoded(frame)) is not None:
                     yield message
             elif MARKER.match(data, at):
-                self._partial = data[at:]
+                if len(self._partials) >= _MOST_PARTIALS:
+                    del self._partials[next(iter(self._partials))]
+                self._partials[sender] = data[at:]
                 return
             else:
                 self.bad_data_count += 1

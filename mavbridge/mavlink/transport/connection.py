@@ -136,7 +136,7 @@ class Connection:
             return
         self._opened += 1
         self._refused_ns = None
-        self._codec.forget_partial()
+        self._codec.forget_partials()
 
     def report(self, text: str) -> None:
         """Keep a text for the user until `take_texts`; advice only the first time."""
@@ -182,7 +182,7 @@ class Connection:
                 self._told_loss = ""
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
-                for message in decode(data):
+                for message in decode(data, sender):
                     self.received_packets += message.name != UNKNOWN
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))

@@ -245,10 +245,23 @@ def test_garbage_and_cut_off_datagrams_cost_nothing_that_comes_after(
     assert isinstance(incoming.body, Heartbeat)
 
 
-def test_a_stream_that_somebody_cut_into_datagrams_is_read() -> None:
+@pytest.mark.parametrize("size", [16, 64, 512])
+def test_a_stream_that_somebody_cut_into_datagrams_is_read(size: int) -> None:
+    """Chunks may begin with a byte of a packet that looks like a marker."""
+    ours, end, station = codec(), WireEnd(), WireEnd(system=255)
+    sent = [end.pack(m.heartbeat_encode(2, 3, 81, 0xFDFEFDFE, 4)) for _ in range(200)]
+    read, data = [], b"".join(sent)[15:]  # its beginning was lost
+    for at in range(0, len(data), size):
+        read += list(ours.decode_datagram(data[at : at + size], ("vehicle", 1)))
+        assert len(list(ours.decode_datagram(station.heartbeat(), ("station", 1)))) == 1
+    assert [message.packet for message in read] == sent[1:]
+
+
+def test_a_packet_is_not_completed_by_another_sender() -> None:
     ours, data = codec(), WireEnd().heartbeat()
-    assert list(ours.decode_datagram(data[:9])) == []
-    (incoming,) = ours.decode_datagram(data[9:])
+    assert list(ours.decode_datagram(data[:9], ("stranger", 1))) == []
+    assert list(ours.decode_datagram(data[9:], ("vehicle", 1))) == []
+    (incoming,) = ours.decode_datagram(data[9:], ("stranger", 1))
     assert isinstance(incoming.body, Heartbeat)
 
 
@@ -267,8 +280,8 @@ def test_a_datagram_is_read_to_its_limit_and_what_is_lost_counts_once() -> None:
 
 def test_bytes_that_begin_nothing_count_once() -> None:
     ours = codec()
-    for data in (b"AT+RESET\r\n", b"x" + WireEnd().heartbeat()):  # no next piece of anything
-        assert list(ours.decode_datagram(data)) == []
+    for data, messages in ((b"AT+RESET\r\n", 0), (b"rest" + WireEnd().heartbeat(), 1)):
+        assert len(list(ours.decode_datagram(data))) == messages
     assert ours.bad_data_count == 2
 
 
