@@ -227,6 +227,7 @@ class DuplicateSystems:
         if self._moved_stamps < _MOVED_STAMPS:
             return False
         self._moved_stamps = 0
+        self._reported.pop(sender, None)  # else it could not move here a second time
         return True
 
     def notice(

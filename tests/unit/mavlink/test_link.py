@@ -292,6 +292,15 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     assert told[0] != told[1]
 
 
+def test_in_flight_a_vehicle_is_followed_each_time_that_it_moves() -> None:
+    rig = Rig().ready()
+    rig.link.is_engaged = True
+    for port in (2, 1, 2, 1):
+        rig.vehicle.address = ("127.0.0.1", port)
+        rig.run(1.0, Command(action=IDLE))  # a heartbeat comes before it counts as moved
+        assert rig.vehicle.answered_to == rig.vehicle.address
+
+
 @pytest.mark.parametrize("is_engaged", [False, True])
 def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     is_engaged: bool,
