@@ -152,7 +152,7 @@ def _serial(spec: str) -> SerialAddress | None:
         return None
     device, after_comma, after_colon = match.groups()
     baud = after_comma if after_comma is not None else after_colon or str(DEFAULT_BAUD)
-    if not (baud.isascii() and baud.isdigit() and int(baud)):
+    if not (baud.isascii() and baud.isdigit() and 0 < int(baud) < 2**31):
         raise UserError(f"--connect {spec}: {baud!r} is not a baud rate; use {FORMS}")
     return SerialAddress(device, int(baud))
 

@@ -111,6 +111,7 @@ def test_special_spellings(spec: str, expected: LinkAddress) -> None:
         ("udp:[::1:14550", "not understood"),
         ("/dev/ttyACM0,fast", "not a baud rate"),
         ("/dev/ttyACM0,0", "not a baud rate"),
+        ("/dev/ttyACM0,2147483648", "not a baud rate"),
         ("http://host:80", "not understood"),
     ],
 )

@@ -75,6 +75,8 @@ class _FileTransport(Transport, Generic[_Handle]):
         self._was_open = False
 
     def _down(self, why: Exception | str) -> TransportDownError:
+        if isinstance(why, termios.error):  # no OSError, but with its arguments
+            why = OSError(*why.args)
         reason = getattr(why, "strerror", None) or why
         return TransportDownError(f"{self._place}: {reason}")
 
@@ -257,7 +259,7 @@ class SerialTransport(_FileTransport[serial.Serial]):
         """Open the port, non-blocking and exclusive."""
         try:
             self._handle = serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
             if self._was_open:
                 raise self._down(error) from error
             raise UserError(
@@ -340,7 +342,7 @@ class SerialTransport(_FileTransport[serial.Serial]):
             self._unsent = b""
 
 
-def _serial_obstacle(device: str, error: OSError | ValueError) -> str:
+def _serial_obstacle(device: str, error: Exception) -> str:
     """Return the obstacle to opening a serial port, with advice."""
     if isinstance(error, FileNotFoundError) or not Path(device).exists():
         names = ", ".join(sorted(info.device for info in list_ports.comports()))

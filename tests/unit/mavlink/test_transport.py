@@ -6,10 +6,12 @@ import re
 import select
 import socket
 import sys
+import termios
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from typing import Any
 
 import pytest
 import serial
@@ -184,6 +186,26 @@ def test_a_serial_device_that_is_unplugged_is_noticed() -> None:
     with pytest.raises(TransportDownError, match="serial"):
         drain_until(ours, b"x", MonotonicClock())
     ours.close()
+
+
+def test_a_serial_device_that_goes_while_it_is_opened_again_can_be_tried_once_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ours_fd, theirs_fd = pty.openpty()
+    ours = SerialTransport(os.ttyname(theirs_fd), 57600, MonotonicClock())
+    ours.open()
+    ours.close()
+    read = termios.tcgetattr
+
+    def unplugged_after(fd: int) -> list[Any]:
+        settings = read(fd)
+        os.close(ours_fd)
+        return settings
+
+    monkeypatch.setattr(termios, "tcgetattr", unplugged_after)
+    with pytest.raises(TransportDownError, match=r"/dev/\S+: Input/output error$"):
+        ours.open()
+    os.close(theirs_fd)
 
 
 def test_a_serial_port_that_nobody_reads_drops_whole_packets_and_never_blocks(
