@@ -87,8 +87,10 @@ class VehicleDiscovery:
             vehicle_type=heartbeat.vehicle_type,
             autopilot=heartbeat.autopilot,
         )
-        if vehicle in self._heard_ns or len(self._heard_ns) < _CAPACITY:
-            self._heard_ns[vehicle] = now_ns
+        self._heard_ns.pop(vehicle, None)
+        if len(self._heard_ns) >= _CAPACITY:
+            del self._heard_ns[next(iter(self._heard_ns))]  # heard longest ago
+        self._heard_ns[vehicle] = now_ns
         if self._first_ns is None and self._is_wanted(vehicle):
             self._first_ns = now_ns
 

@@ -86,6 +86,18 @@ def test_a_vehicle_that_was_followed_in_flight_is_not_sought_where_it_was() -> N
     assert discovery.moved(followed, start_ns + 7 * S) == before
 
 
+def test_a_vehicle_is_followed_however_often_it_moves() -> None:
+    discovery = VehicleDiscovery(target_system=0)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 0), 0)
+    vehicle = discovery.choose(2 * S)
+    for port in range(1, 200):
+        assert vehicle is not None
+        discovery.receive(Endpoint(1, 1), heartbeat(), ("host", port), 10 * S * port)
+        vehicle = discovery.moved(vehicle, 10 * S * port)
+    assert vehicle is not None
+    assert vehicle.address == ("host", 199)
+
+
 @pytest.mark.parametrize(
     ("heard", "expected"),
     [
