@@ -216,8 +216,7 @@ class MavlinkLink:
             case Timesync() as reply:
                 self._timesync.receive(reply, arrived_ns)
             case CommandAck() as ack:
-                is_for_us = ack.target in ((0, 0), self._codec.source)
-                if is_for_us:
+                if is_for_us := ack.target in ((0, 0), self._codec.source):
                     self.commands.receive(ack)
         if is_for_us:
             before = vehicle.params.interruption
@@ -290,7 +289,8 @@ class MavlinkLink:
         elif not self.is_engaged:
             here = self.vehicle.identity
             if (moved := self._discovery.moved(here, now_ns)) is not None:
-                self._interrupt(because(Code.MOVED_AT_REST, before=here.place, now=moved.place))
+                if moved.address != here.address:
+                    self._interrupt(because(Code.MOVED_AT_REST, before=here.place, now=moved.place))
                 self._adopt(moved)
         if self._sender.is_release_owed and not self._sender.try_release():
             return

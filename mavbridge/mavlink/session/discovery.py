@@ -87,6 +87,10 @@ class VehicleDiscovery:
             vehicle_type=heartbeat.vehicle_type,
             autopilot=heartbeat.autopilot,
         )
+        if vehicle not in self._heard_ns:  # a new type at an old address replaces the old type
+            for other in self._heard_ns:
+                if (other.source, other.address) == (source, address):
+                    self._heard_ns[other] = now_ns - MOVED_NS
         self._heard_ns.pop(vehicle, None)
         if len(self._heard_ns) >= _CAPACITY:
             del self._heard_ns[next(iter(self._heard_ns))]  # heard longest ago
@@ -110,7 +114,8 @@ class VehicleDiscovery:
         """
         if self._first_ns is None or now_ns - self._first_ns < SETTLE_NS:
             return None
-        wanted = [vehicle for vehicle in self._heard_ns if self._is_wanted(vehicle)]
+        heard = [each for each, at_ns in self._heard_ns.items() if now_ns - at_ns < MOVED_NS]
+        wanted = [vehicle for vehicle in heard if self._is_wanted(vehicle)]
         systems = sorted({vehicle.source.system for vehicle in wanted})
         if len(systems) > 1:
             raise PeerError(
@@ -123,10 +128,10 @@ class VehicleDiscovery:
                 f"two vehicles use system id {systems[0]} (from {addresses}): give one of them "
                 "another id (MAV_SYSID, SYSID_THISMAV) or another port"
             )
-        return wanted[0]
+        return wanted[0] if wanted else None
 
     def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
-        """Return the same vehicle at its new address, or None if it has not moved."""
+        """Return the vehicle at its new address or with its new type; None if it has neither."""
         # One that was followed to a new address may not have sent a heartbeat from there yet.
         if now_ns - self._heard_ns.setdefault(vehicle, now_ns) < MOVED_NS:
             return None

@@ -292,6 +292,15 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     assert told[0] != told[1]
 
 
+def test_a_vehicle_that_becomes_a_plane_is_refused_and_has_not_moved() -> None:
+    rig = Rig().ready()
+    plane = rig.vehicle.end.mav.heartbeat_encode(1, 3, 81, 0, 4)
+    rig.vehicle.end.heartbeat = lambda: rig.vehicle.end.pack(plane)  # type: ignore[method-assign]
+    with pytest.raises(PeerError, match="FIXED_WING"):
+        rig.run(1.5)
+    assert not any("now sends from" in text for text in rig.texts)
+
+
 def test_in_flight_a_vehicle_is_followed_each_time_that_it_moves() -> None:
     rig = Rig().ready()
     rig.link.is_engaged = True

@@ -86,6 +86,23 @@ def test_a_vehicle_that_was_followed_in_flight_is_not_sought_where_it_was() -> N
     assert discovery.moved(followed, start_ns + 7 * S) == before
 
 
+def test_a_vehicle_that_changes_its_type_is_one_vehicle() -> None:
+    """ArduPilot is a quadrotor until its motors are set up."""
+    discovery = VehicleDiscovery(target_system=0)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 0)
+    discovery.receive(Endpoint(1, 1), heartbeat(dialect.MAV_TYPE_HEXAROTOR), ("host", 5), S)
+    vehicle = discovery.choose(2 * S)
+    assert vehicle is not None
+    assert vehicle.vehicle_type == dialect.MAV_TYPE_HEXAROTOR
+    assert discovery.moved(vehicle, 2 * S) is None
+    discovery.receive(Endpoint(1, 1), heartbeat(dialect.MAV_TYPE_TRICOPTER), ("host", 5), 3 * S)
+    moved = discovery.moved(vehicle, 3 * S)
+    assert moved == replace(vehicle, vehicle_type=dialect.MAV_TYPE_TRICOPTER)
+    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 3 * S)  # both: two, by a router
+    with pytest.raises(PeerError, match="two vehicles"):
+        discovery.choose(4 * S)
+
+
 def test_a_vehicle_is_followed_however_often_it_moves() -> None:
     discovery = VehicleDiscovery(target_system=0)
     discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 0), 0)
