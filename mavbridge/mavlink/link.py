@@ -325,7 +325,7 @@ class MavlinkLink:
                 waited_s,
                 heard.received_bytes,
                 heard.received_packets,
-                heard.refusals,
+                heard.obstacles(now_ns),
             )
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 

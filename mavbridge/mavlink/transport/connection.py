@@ -77,6 +77,10 @@ class Transport(Protocol):
         the connection is lost.
         """
 
+    def refusal(self) -> str:
+        """Return why the system refused the last packet; empty if it took it."""
+        return ""
+
     def close(self) -> None:
         """Close the socket or port; safe to call twice."""
         return
@@ -205,6 +209,15 @@ class Connection:
         """Why packets were rejected by the signature check, a sentence for each kind."""
         signing = self._codec.signing
         return [] if signing is None else [REFUSALS[refusal] for refusal in signing.refused]
+
+    def obstacles(self, now_ns: int) -> list[str]:
+        """Return why no vehicle is heard: the system refuses our packets, or we refuse its."""
+        if self.received_bytes or not self.is_refused(now_ns):
+            return self.refusals
+        if not (refusal := self._transport.refusal()):
+            return []
+        where = "check the address, the network and the firewall"
+        return [f"this computer refuses to send there ({refusal}): {where}"]
 
     @property
     def hint(self) -> Reason | None:

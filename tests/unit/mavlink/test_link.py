@@ -26,6 +26,7 @@ from mavbridge.core.vehicle import (
 from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
+from mavbridge.mavlink.transport.sockets import make_transport
 
 MS = NS_PER_MS
 PARAMS = CALIBRATION | {
@@ -421,3 +422,14 @@ def test_without_a_vehicle_the_cause_is_told(is_signed: bool, sends_noise: bool)
     rig.clock.advance_ns(1000 * MS)
     with pytest.raises(PeerError, match=told):
         rig.link.service()
+
+
+def test_a_system_that_refuses_every_packet_is_told() -> None:
+    clock, spec = FakeClock(), "udpout:255.255.255.255:14550"  # a broadcast needs a permission
+    settings = LinkSettings(connect=spec, connect_timeout_s=1.0)
+    link = MavlinkLink(make_transport(spec, clock), clock, settings)
+    link.service()
+    clock.advance_ns(1100 * MS)
+    with pytest.raises(PeerError, match=r"refuses to send there \((Permission|Network)"):
+        link.service()
+    link.close()
