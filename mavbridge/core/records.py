@@ -98,7 +98,7 @@ class Tick:
     state: VehicleState | None
     trace: ActionTrace | None
     sent: Action | None
-    """The action as sent, rounded by the message; None if released or read-only."""
+    """The action as sent, rounded by the message; None if released, read-only or refused."""
     release_reason: Reason | None
     """Why the policy does not fly; None while it does, or if the guard has not said why."""
     mode: str | None
@@ -121,6 +121,14 @@ class Tick:
     decided_ns: int | None = None
     """Time for which the action was computed: the slot, or the arrival of a chunk between two
     slots. None in old records."""
+    readonly: bool = False
+    """True if the flight sends no action; in a recording, if no tick has one."""
+
+    @property
+    def is_refused(self) -> bool:
+        """True if an action was due, but the link did not take it."""
+        is_due = self.trace is not None or self.phase in ("leaving", "holding")
+        return is_due and self.sent is None and not self.readonly
 
     @property
     def activity(self) -> str:
@@ -129,7 +137,7 @@ class Tick:
             return f"{self.holder}: {self.release_reason}"
         if self.trace is None:
             return "PREPARING: not in control yet"
-        if self.sent is None:
+        if self.readonly:
             return "READ-ONLY: the policy runs, nothing is sent"
         return "FLYING: the policy has control"
 
@@ -137,7 +145,7 @@ class Tick:
     def stage(self) -> tuple[object, ...]:
         """Key that is equal for ticks whose ``activity`` differs by figures alone."""
         reason = None if self.release_reason is None else self.release_reason.key
-        return self.holder, reason, self.trace is None, self.sent is None
+        return self.holder, reason, self.trace is None, self.readonly
 
     @property
     def holder(self) -> str:

@@ -69,7 +69,7 @@ class TelemetryCache:
         )
         """Every action that was sent."""
         self.reader = StateReader(plan)
-        self._sink = sink
+        self._sink, self._readonly = sink, plan.config.link.readonly
         self._watch_packets = watch_packets
         self.telemetry = Telemetry()
         """Newest reading of each quantity."""
@@ -187,8 +187,10 @@ class TelemetryCache:
             self.flights += 1
         self.phase, self.reason = tick.phase, tick.reason
         self.starting_ns = tick.starting_ns
-        self.history.append(tick.sent, tick.sent_ns)
-        self._sink.emit(self._join(tick))
+        joined = self._join(tick)
+        if not joined.is_refused:  # else the vehicle still flies the last action
+            self.history.append(tick.sent, tick.sent_ns)
+        self._sink.emit(joined)
         self._was_flown = tick.trace is not None
         self._serial += 1
 
@@ -227,6 +229,7 @@ class TelemetryCache:
             phase=sent.phase.value,
             chunk_computed_ns=solve.computed_ns if solve else None,
             position_ned_m=Position(*position.values) if position and is_placed else None,
+            readonly=self._readonly,
         )
 
 

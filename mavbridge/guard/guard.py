@@ -124,9 +124,11 @@ class Guard:
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
-        """Discard the last decision, which was not sent; continue from the one before."""
+        """Discard the last decision, which was not sent; continue from the one before. A read-only
+        flight goes on as if it were sent."""
         if not self._engagement.settings.readonly:
             self._smoother.undo()
+            self._grid.unserve()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
         """Advance to ``now_ns`` with the given news; return the actions to take."""

@@ -164,8 +164,8 @@ class StickGrid:
         self._period_ns = period_ns
         self._origin_ns = origin_ns
         self._index = -1
-        self._served_ns = origin_ns - period_ns
-        """Last send, or last slot with nothing to send."""
+        self._served_ns = self._before_ns = origin_ns - period_ns
+        """Last send, or last slot with nothing to send; and the one before."""
 
     @property
     def next_ns(self) -> int:
@@ -179,14 +179,20 @@ class StickGrid:
             return None
         first, self._index = self._index + 1, index
         missed = index - first
-        first_ns = self._origin_ns + first * self._period_ns
-        if first_ns - self._served_ns < self._period_ns // 2:
+        unserved_ns = self._origin_ns + first * self._period_ns - self._served_ns
+        if unserved_ns < self._period_ns // 2:
             if not missed:
                 return None
             missed -= 1
+        elif unserved_ns >= self._period_ns + self._period_ns // 2:
+            missed += 1  # the slot taken before, whose send was refused
         due_ns = self._origin_ns + index * self._period_ns
         return Slot(index=index, due_ns=due_ns, missed=missed)
 
     def serve(self, sent_ns: int) -> None:
         """Note that sticks were sent, or that there was nothing to send."""
-        self._served_ns = sent_ns
+        self._before_ns, self._served_ns = self._served_ns, sent_ns
+
+    def unserve(self) -> None:
+        """Take the last ``serve`` back: the link refused the sticks."""
+        self._served_ns = self._before_ns

@@ -146,7 +146,7 @@ class FlightTiming:
         self._ticks.add(tick.woke_ns)
         self._sticks.add(tick)
         self._chunks.add(tick)
-        if tick.trace is not None:
+        if tick.trace is not None and not tick.is_refused:
             self._add_ages(tick)
         is_before = tick.phase in ("waiting", "preparing")
         reason = None if is_before else tick.release_reason
@@ -223,15 +223,16 @@ class _Sticks:
         if tick.trace is None:
             self._last_ns = None
             return
-        self._sends += 1
-        self._coasting += tick.is_coasting
-        if tick.is_slot:
+        is_sent = not tick.is_refused
+        self._sends += is_sent
+        self._coasting += is_sent and tick.is_coasting
+        if is_sent and tick.is_slot:
             self._lateness.add(max(0, tick.sent_ns - tick.due_ns))
         if self._last_ns is None:
             self._stretches += 1
         else:
             self._missed += tick.missed_slots
-            self._intervals += 1
+            self._intervals += is_sent
             self._flying_ns += tick.woke_ns - self._last_ns
         self._last_ns = tick.woke_ns
 

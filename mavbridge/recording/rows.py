@@ -159,10 +159,11 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
     Whole columns are never converted to Python objects at once.
     """
     serial, make = -1, ACTION_CLASSES[action]
+    readonly = table.column("sent").null_count == table.num_rows
     for row in _rows(table):
         serial += 1 + row["dropped_before"]
-        expert = row.get("expert")
-        yield TickRow(_tick(row, serial, make), row["dropped_before"], expert and make(*expert))
+        expert, tick = row.get("expert"), _tick(row, serial, make, readonly=readonly)
+        yield TickRow(tick, row["dropped_before"], expert and make(*expert))
 
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:
@@ -181,7 +182,7 @@ def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
         yield from batch.to_pylist()
 
 
-def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
+def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: bool) -> Tick:
     values = {name: row[name] for name in _TICK}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
@@ -196,7 +197,8 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
         state = VehicleState(values=array, **{name: row[name] for name in STATE_STAMPS})
     if row["raw"] is not None:
         trace = ActionTrace(**{name: make(*row[name]) for name in ActionTrace._fields})
-    return Tick(**values | {"serial": serial, "state": state, "trace": trace})
+    values |= {"serial": serial, "state": state, "trace": trace, "readonly": readonly}
+    return Tick(**values)
 
 
 def read_reason(code: str | None, data: str) -> Reason | None:

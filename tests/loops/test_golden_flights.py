@@ -54,6 +54,16 @@ def numpy_runner() -> Iterator[PolicyRunner]:
         yield loaded.runner
 
 
+def test_an_action_that_was_refused_in_flight_is_refused_in_the_replay() -> None:
+    source = golden("numpy_px4")
+    at = [k for k, tick in enumerate(source.ticks) if tick.trace is not None][150]
+    refused = replace(source.ticks[at], sent=None)
+    ticks = (*source.ticks[:at], refused, *source.ticks[at + 1 :])
+    replayed = replay_guard(replace(source, ticks=ticks))[at].replayed
+    assert replayed is not None
+    assert (replayed.trace is not None, replayed.sent) == (True, None)
+
+
 def repeated(source: ReplaySource, runner: PolicyRunner) -> PolicyComparison:
     clock = stepped_clock(source)
     return compare_policy(replay_policy(source, runner, clock, source.features))

@@ -67,8 +67,8 @@ class HolderSpan:
 
 def _holder(tick: Tick) -> Holder:
     if tick.trace is not None:
-        return "read-only" if tick.sent is None else "policy"
-    if tick.sent is not None:
+        return "read-only" if tick.readonly else "policy"
+    if tick.sent is not None or tick.is_refused:
         return "idle" if tick.phase == "preparing" else "neutral"
     return "release" if tick.phase == "releasing" else "pilot"
 

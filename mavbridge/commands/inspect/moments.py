@@ -21,6 +21,7 @@ Stamps: TypeAlias = NDArray[np.int64]
 Cause = Literal[
     "the guard woke late",
     "sending took long",
+    "the link refused the command",
     "the policy took long",
     "the attitude came late",
     "the policy loop began late",
@@ -102,9 +103,12 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Moment]:
     for last, tick in pairwise(ticks):
         is_flown = last.trace is not None and tick.trace is not None
         if is_flown and tick.missed_slots and not is_gap(last, tick):
-            delay_ms = max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS
+            due_ns = last.due_ns if last.is_refused else last.sent_ns + slot_ns
+            delay_ms = max(0.0, tick.sent_ns - due_ns) / NS_PER_MS
             is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
             cause: Cause = "sending took long" if is_slow_send else "the guard woke late"
+            if last.is_refused:
+                cause = "the link refused the command"
             count = tick.missed_slots
             what = f"{count} missed slot{'' if count == 1 else 's'}"
             yield _delay(_t_s(ticks, tick.woke_ns), what, delay_ms, cause, count)

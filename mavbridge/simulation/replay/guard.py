@@ -79,6 +79,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     for tick, chunk, act, stop in _arrivals(source):
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
+        transport.is_refusing = tick.is_refused
         messages: tuple[Chunk | OperatorCommand | EndRequest | None, ...] = (chunk, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
@@ -225,6 +226,8 @@ class _RecordedTransport(Transport):
         self._next = next(self._packets, None)
         self.sent_ns: int | None = None
         """Time at which the sticks of this pass had left."""
+        self.is_refusing = False
+        """True if the last recorded action was refused."""
 
     @property
     def next_arrival_ns(self) -> int | None:
@@ -239,11 +242,11 @@ class _RecordedTransport(Transport):
             yield Received(packet.data, packet.arrived_ns, VEHICLE)
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
-        """Advance the clock to the recorded end of sending."""
+        """Advance the clock to the recorded end of sending; refuse what was refused then."""
         if self.sent_ns is not None:
             self._clock.sleep_until_ns(self.sent_ns)
             self.sent_ns = None
-        return True
+        return not self.is_refusing
 
 
 class _RecordedPort:

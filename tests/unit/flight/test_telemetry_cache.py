@@ -153,6 +153,7 @@ def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
 
 def test_history_follows_what_was_sent() -> None:
     viewed = Viewed(Contract(history_len=2, history_dt_s=0.01)).receive(TICK)
+    viewed.receive(TICK._replace(sent=None))  # refused by the link: the vehicle flies on
     at_ns = TICK.sent_ns + 20 * MS
     assert viewed.view.history.resample(at_ns).tolist() == [[pytest.approx(STICKS)] * 2]
     viewed.receive(NOBODY._replace(sent_ns=at_ns))

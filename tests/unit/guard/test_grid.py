@@ -50,3 +50,24 @@ def test_a_slot_that_was_served_less_than_half_a_period_early_is_left_out() -> N
     ):
         grid.serve(served_ns)
         assert (grid.take(slot_ms * MS) is None) is is_left_out
+
+
+@pytest.mark.parametrize(
+    ("sends", "missed"),
+    [
+        ({10: False, 20: True}, 1),
+        ({10: False, 13: True, 20: True}, 0),  # a new chunk within the period
+        ({10: True, 13: False, 20: True}, 0),
+        ({10: False, 20: False, 30: True}, 2),
+        ({10: False, 45: True}, 3),  # and a stall
+    ],
+)
+def test_a_slot_whose_send_was_refused_is_missed(sends: dict[int, bool], missed: int) -> None:
+    grid, counted = StickGrid(PERIOD, 0), 0
+    for at_ms, is_taken in {0: True, **sends}.items():
+        slot = grid.take(at_ms * MS)
+        counted += slot.missed if slot else 0
+        grid.serve(at_ms * MS)
+        if not is_taken:
+            grid.unserve()
+    assert counted == missed

@@ -85,7 +85,7 @@ def test_the_line_shows_what_the_newest_tick_says(tick: Tick, expected: str) -> 
 
 def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
     screen = make_screen(readonly=True)
-    screen.emit(make_tick(0, sent=None))
+    screen.emit(make_tick(0, sent=None, readonly=True))
     assert screen.status_line().plain.startswith("READ-ONLY  ")
     screen.emit(make_released_tick(1, because(Code.NO_IMAGE)))
     line = screen.status_line().plain
@@ -113,8 +113,9 @@ def test_messages_are_printed_once_in_order() -> None:
     screen.emit(make_released_tick(1, reason=no_state))
     screen.emit(make_tick(2, trace=None, phase="preparing"))
     screen.emit(make_tick(3, phase="flying"))
+    screen.emit(make_tick(3, sent=None, phase="flying"))  # refused by the link
     screen.emit(make_released_tick(4, because(Code.DISARMED), phase="released"))
-    screen.emit(make_tick(5, sent=None, phase="flying"))
+    screen.emit(make_tick(5, sent=None, phase="flying", readonly=True))
     for _ in range(2):
         screen.refresh()
     assert out.getvalue().splitlines() == [

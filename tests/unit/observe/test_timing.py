@@ -66,7 +66,8 @@ TICKS: dict[str, list[Tick]] = {
     "overtaken": [make_tick(0), make_tick(2), make_tick(4)],
     "release": [make_tick(0), make_released_tick(1), make_tick(50), make_tick(51)],
     "one attitude": [make_tick(index, state=SAME) for index in range(3)],
-    "readonly": [make_tick(0, sent=None), make_tick(1, sent=None)],
+    "readonly": [make_tick(k, sent=None, readonly=True) for k in (0, 1)],
+    "refused": [make_tick(0), make_tick(1, sent=None), make_tick(2, missed_slots=1)],
     "not flown": [make_released_tick(index) for index in range(5)],
     "one tick": [make_tick(0)],
     "waits fast, flies slowly": [
@@ -99,13 +100,16 @@ TICKS: dict[str, list[Tick]] = {
         ("release", "action.chunks action.late_chunks", (3, 0)),
         ("one attitude", "state_to_wire_ms state_age_ms.max", (all_equal(2.0), 22.0)),
         ("readonly", "state_to_wire_ms state_age_ms", (None, all_equal(3.0))),
+        ("readonly", "sticks.sends sticks.rate_hz", (2, 100.0)),
+        ("refused", "sticks.sends sticks.slots sticks.missed_slots", (2, 3, 1)),
+        ("refused", "sticks.rate_hz state_age_ms", (50.0, all_equal(3.0))),
         ("not flown", "feature_age_ms state_age_ms state_to_wire_ms", (None,) * 3),
         ("not flown", "action.predict_ms action.period_ms sticks.rate_hz", (None,) * 3),
         ("one tick", "action.rate_hz sticks.rate_hz action.period_ms", (None,) * 3),
         ("waits fast, flies slowly", "sticks.rate_hz sticks.flying_s", (20.0, 0.5)),
         ("waits fast, flies slowly", "sticks.sends sticks.missed_slots", (11, 40)),
         ("waits fast, flies slowly", "action.rate_hz action.late_chunks", (20.0, 10)),
-        ("no reason", "release_count sticks.sends", (0, 1)),
+        ("no reason", "release_count sticks.sends", (0, 0)),
     ],
 )
 def test_figures(name: str, paths: str, values: tuple[object, ...]) -> None:

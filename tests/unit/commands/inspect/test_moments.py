@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,12 +85,17 @@ def test_a_chunk_after_a_long_solve_is_late_by_that_solve() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sending_ms", "cause"), [(2, "the guard woke late"), (8, "sending took long")]
+    ("sending_ms", "changes", "cause"),
+    [
+        (2, {}, "the guard woke late"),
+        (8, {}, "sending took long"),
+        (8, {"sent": None}, "the link refused the command"),
+    ],
 )
 def test_missed_slots_are_put_down_to_the_send_before_or_to_the_wake_up(
-    sending_ms: int, cause: str
+    sending_ms: int, changes: dict[str, Any], cause: str
 ) -> None:
-    slow = make_tick(4, sent_ns=START_NS + 4 * TICK_NS + sending_ms * NS_PER_MS)
+    slow = make_tick(4, sent_ns=START_NS + 4 * TICK_NS + sending_ms * NS_PER_MS, **changes)
     after = make_tick(
         7, serial=5, missed_slots=2, chunk_serial=4, chunk_computed_ns=slow.chunk_computed_ns
     )
@@ -103,8 +109,8 @@ def test_who_held_the_sticks_when() -> None:
         make_released_tick(0, because(Code.NOT_ENGAGED), phase="waiting"),
         make_released_tick(1, because(Code.WAITING_FOR_ARMING), phase="preparing", sent=NEUTRAL),
         make_tick(2, phase="flying"),
-        make_tick(3, phase="flying", is_coasting=True),
-        make_released_tick(4, old, phase="leaving", sent=NEUTRAL),
+        make_tick(3, phase="flying", sent=None),
+        make_released_tick(4, old, phase="leaving"),  # both refused by the link
         make_released_tick(5, old, phase="releasing"),
         make_released_tick(6, old, phase="released"),
         make_released_tick(7, because(Code.DISARMED), phase="released"),
@@ -115,7 +121,7 @@ def test_who_held_the_sticks_when() -> None:
     assert [span.start_s for span in spans] == pytest.approx([0.0, 0.01, 0.02, 0.04, 0.05, 0.06])
     assert [span.end_s for span in spans[:-1]] == [span.start_s for span in spans[1:]]
     assert [span.reason for span in spans[2:4]] == [None, old]
-    (looking_on,) = holder_spans([make_tick(0, sent=None), make_tick(1, sent=None)], START_NS)
+    (looking_on,) = holder_spans([make_tick(0, sent=None, readonly=True)], START_NS)
     assert looking_on.holder == "read-only"
 
 
