@@ -75,12 +75,11 @@ def build_bridge(
         samples: where the vehicle's readings come from, if not with the guard's other messages.
         delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
-    camera, contract = plan.config.camera, plan.contract
+    camera = plan.config.camera
     view = TelemetryCache(plan, sink=FanOut(sinks), samples=samples, watch_packets=watch_packets)
     encoder_lock = threading.Lock()
-    rates_hz = contract.camera_rates_hz or (plan.loops.vision_hz,) * len(contract.cameras)
     visions = []
-    for number, (path, rate_hz) in enumerate(zip(cameras, rates_hz, strict=True)):
+    for number, (path, rate_hz) in enumerate(zip(cameras, plan.image_rates_hz, strict=True)):
         watch: ImageWatch | None = None
         if watches_images:
             watch = ImageWatch(
@@ -92,7 +91,7 @@ def build_bridge(
             cache=path.cache,
             sink=delay_vision(FanOut(all_cameras if number else sinks)),
             clock=path.clock,
-            period_ns=period_ns(min(plan.loops.vision_hz, rate_hz)),
+            period_ns=period_ns(rate_hz),
             encoder_lock=encoder_lock,
             image_watch=watch,
             is_airborne=lambda: view.is_airborne,

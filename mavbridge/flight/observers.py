@@ -62,7 +62,7 @@ class FlightObservers:
         self._runner = runner
         self._clock = clock
         self._mode: Mode = "dual" if plan.is_dual else "single"
-        action_hz, vision_hz = plan.loops.action_hz, plan.loops.vision_hz
+        action_hz, vision_hz = plan.loops.action_hz, plan.image_rates_hz[0]
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
         )
@@ -110,7 +110,7 @@ class FlightObservers:
             return
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
-            vision_hz=self._plan.loops.vision_hz,
+            vision_hz=self._plan.image_rates_hz[0],
             chunk_hz=self._plan.loops.action_hz,
             stick_hz=config.rates.stick_rate,
             contract=contract,
@@ -149,7 +149,7 @@ class FlightObservers:
             engine=self._runner.engine,
             mode=self._mode,
             action_hz=self._plan.loops.action_hz,
-            visual_hz=self._plan.loops.vision_hz,
+            visual_hz=self._plan.image_rates_hz[0],
             contract=self._runner.contract,
             seed=self._config.policy.seed,
             plan=self._plan.figures(),

@@ -33,6 +33,13 @@ class FlightPlan:
     guard: FlightSettings
     """Settings of the guard. Its ``freshness`` applies while a chunk is played."""
 
+    @property
+    def image_rates_hz(self) -> tuple[float, ...]:
+        """Images encoded per second of each camera, in the contract's order."""
+        most_hz, cameras = self.loops.vision_hz, self.contract.cameras
+        rates_hz = self.contract.camera_rates_hz or (most_hz,) * len(cameras)
+        return tuple(min(most_hz, rate_hz) for rate_hz in rates_hz)
+
     def figures(self) -> dict[str, float]:
         """Return rates, periods and limits by name, for ``check`` and ``meta.json``."""
         limits, smoothing, envelope = (

@@ -50,7 +50,7 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
         PolicyError: the policy clearly cannot keep the limits of its own contract.
     """
     contract, is_dual, loops, rates = plan.contract, plan.is_dual, plan.loops, plan.config.rates
-    action_hz, image_hz = loops.action_hz, min((loops.vision_hz, *contract.camera_rates_hz))
+    action_hz, image_hz = loops.action_hz, min(plan.image_rates_hz)
     flag = "rates.action" if is_dual else "rates.single"
     notes: list[str] = []
     if is_dual and rates.rate is not None and rates.action_rate is None:

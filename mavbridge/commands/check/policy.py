@@ -163,7 +163,7 @@ def _run_at_rates(
             runner.encode(image, camera)
 
     chunks = Pace(name="chunks", asked_hz=loops.action_hz)
-    pictures = Pace(name="images", asked_hz=min((loops.vision_hz, *contract.camera_rates_hz)))
+    pictures = Pace(name="images", asked_hz=min(plan.image_rates_hz))
     workers = []
     for pace, call, is_realtime in (
         (chunks, lambda: runner.act(encoded, state, history), plan.config.rates.realtime),

@@ -104,19 +104,18 @@ def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeed
             return []
         contract = Contract()
         names, sources = config.camera.sources, config.camera.sources
-        most_hz = config.rates.visual_rate
+        rates_hz = (config.rates.visual_rate,) * len(sources)
         max_age_s = contract.max_feature_age_s
     else:
         contract = plan.contract
         names, sources = contract.cameras, config.camera.sources_of(contract.cameras)
-        most_hz = plan.loops.vision_hz
+        rates_hz = plan.image_rates_hz
         max_age_s = plan.start_limits.feature_ns / NS_PER_S
-    rates_hz = contract.camera_rates_hz or (most_hz,) * len(sources)
     return [
         CameraNeeds(
             name=name if len(names) > 1 else "",
             source=source,
-            rate_hz=min(rate_hz, most_hz),
+            rate_hz=rate_hz,
             size_px=least_source_px(contract),
             max_age_s=max_age_s,
             is_flown_by=looks_at_images(config),

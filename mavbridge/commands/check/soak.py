@@ -107,7 +107,7 @@ class FlightMeter:
         self._timing = FlightTiming(
             stick_hz=plan.config.rates.stick_rate,
             action_hz=plan.loops.action_hz,
-            vision_hz=plan.loops.vision_hz,
+            vision_hz=plan.image_rates_hz[0],
         )
         self._first: Usage | None = None
         self._last: Usage | None = None

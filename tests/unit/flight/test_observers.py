@@ -16,7 +16,7 @@ from policy.engines.runner import ExecutionSettings, make_numpy_runner
 
 
 class Hovering:
-    contract = Contract(arrays="numpy")
+    contract = Contract(arrays="numpy", camera_rates_hz=(10.0,))
 
     def predict(
         self, image: np.ndarray, state: np.ndarray, history: np.ndarray, steps: int
@@ -35,6 +35,7 @@ def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     said = io.StringIO()
     observers(tmp_path, said).finish(None, "ardupilot", None)
     assert f"--report {tmp_path}: Is a directory" in said.getvalue()
+    assert " of 10 Hz" in said.getvalue(), "the rate of the contract's camera"
 
 
 def test_the_terminal_is_given_back_even_if_the_report_fails(

@@ -64,6 +64,13 @@ def test_every_camera_of_a_policy_gets_the_vehicles_images() -> None:
     assert (config.link.connect, config.arm) == ("udp:127.0.0.1:5", True)
 
 
+def test_images_are_judged_by_the_rate_of_the_first_camera() -> None:
+    plan = make_plan(replace(RATES, camera_rates_hz=(10.0, 60.0)))
+    assert plan.image_rates_hz == (10.0, 30.0)
+    meter = FlightMeter(plan, make_runner([]), clock=FakeClock(), guard_pid=os.getpid())
+    assert meter.report().vision.target_hz == 10.0
+
+
 def test_a_flight_is_measured_from_its_first_action_on() -> None:
     meter = make_meter(FakeClock())
     for index in range(50):
