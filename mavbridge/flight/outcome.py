@@ -78,7 +78,7 @@ class FlightReferee:
         self._began_ns = 0
         self._flown: Tick | None = None
         """Last tick in which the policy had control."""
-        self._has_position = self._is_flying = self._is_disarmed = False
+        self._has_position = self._is_flying = False
         self._reason: Reason | None = None
 
     def emit(self, event: Event) -> None:
@@ -96,11 +96,7 @@ class FlightReferee:
             self._reason = event.release_reason
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
-            is_ours = event.phase in (Phase.FLYING.value, Phase.LEAVING.value)
-            if is_ours or not self._is_disarmed:
-                self._crashes.see(event, counts_falls=is_ours)
-            # Where a hand disarms what we hold or have released, the fall is its doing.
-            self._is_disarmed = not is_ours and not event.armed
+            self._crashes.see(event)
 
     @property
     def has_flown(self) -> bool:

@@ -3,6 +3,7 @@
 import math
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import VehicleText, recorded_text
@@ -17,24 +18,31 @@ FALL_MPS = 1.5
 _WORDS = ("crash", "flight termination", "lockdown")
 """Words in the crash messages of ArduPilot ("Crash: Disarming") and PX4 ("Flight termination
 active", "Lockdown")."""
+_PILOTS = because(Code.PILOT_FLIES)
+"""Reason of every tick in a pilot's recording."""
 
 
 class CrashWatch:
-    """Crash detector. It takes the ticks of a flight in order; ``reason`` is the first crash."""
+    """Crash detector. It takes the ticks of a flight in order; ``reason`` is the first crash.
+
+    If a hand disarms a vehicle that the policy no longer flies, the fall is its doing.
+    """
 
     def __init__(self) -> None:
         self.reason: str | None = None
         self._over_since_ns: int | None = None
-        self._was_armed = False
+        self._was_armed = self._is_disarmed = False
         self._disarmed_ns: int | None = None
 
-    def see(self, tick: Tick, *, counts_falls: bool = True) -> None:
-        """Process one tick. ``counts_falls=False`` ignores falls after an intended disarming."""
-        fallen = self._fallen(tick)
-        if self.reason is None:
+    def see(self, tick: Tick) -> None:
+        """Process one tick."""
+        fallen, is_pilots = self._fallen(tick), tick.release_reason == _PILOTS
+        counts_falls = is_pilots or tick.phase in (None, "flying", "leaving")
+        if self.reason is None and (counts_falls or not self._is_disarmed):
             self.reason = self._said(tick) or self._overturned(tick)
             if counts_falls:
                 self.reason = self.reason or fallen
+        self._is_disarmed = not counts_falls and not tick.armed
 
     def _said(self, tick: Tick) -> str | None:
         for text in map(recorded_text, tick.texts):

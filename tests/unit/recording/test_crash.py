@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.factories import make_state, make_tick
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
 from mavbridge.recording.crash import CrashWatch
 
@@ -45,6 +46,8 @@ def test_the_vehicle_says_that_it_has_crashed(text: str, is_crash: bool) -> None
 
 OVER, FLYING = {"state": state(tilt_deg=180.0)}, {"state": state(speed_mps=0.1)}
 FALLING = {"state": state(speed_mps=3.0), "armed": False}
+TAKEN = {"phase": "released", "release_reason": because(Code.OPERATOR)}
+PILOTS = {"phase": "released", "release_reason": because(Code.PILOT_FLIES)}
 
 
 @pytest.mark.parametrize(
@@ -61,6 +64,10 @@ FALLING = {"state": state(speed_mps=3.0), "armed": False}
             id="lands and is carried",
         ),
         pytest.param([(0.5, FALLING)], None, id="never armed"),
+        pytest.param([(1.0, FLYING | TAKEN), (0.5, FALLING | TAKEN)], None, id="by a hand"),
+        pytest.param(
+            [(1.0, FLYING | PILOTS), (0.5, FALLING | PILOTS)], "disarmed in", id="a pilot's flight"
+        ),
     ],
 )
 def test_a_vehicle_that_stays_over_or_is_disarmed_in_the_air_has_crashed(
