@@ -19,6 +19,8 @@ import openvino as ov
 import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves
 
 from policy.engines.openvino_compile import (
     compile_graph,
@@ -40,6 +42,14 @@ from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
+_DECIDES = "it decides by the values of a tensor, which a graph cannot"
+_READS = frozenset(
+    (
+        *("__bool__", "__int__", "__float__", "__index__", "__contains__", "__array__"),
+        *("item", "tolist", "numpy", "equal", "allclose", "is_nonzero"),
+    )
+)
+"""Functions that give Python the value of a tensor; a trace would silently freeze it."""
 MAX_OPERATIONS = 4000
 """Largest number of operations in one graph, 3 ms each to convert; ten unrolled steps of a TOGE are
 2,700, one is 500."""
@@ -98,7 +108,7 @@ class ModuleConverter:
         self._is_script = any(
             isinstance(module, torch.jit.ScriptModule) for module in self._modules.modules()
         )
-        """Traced TorchScript keeps data-dependent decisions, and torch.export rejects it."""
+        """Traced TorchScript keeps its own decisions by values, and torch.export rejects it."""
         self._models: dict[str, ov.Model] = {}
 
     def compile(
@@ -133,16 +143,20 @@ def _float_tensor(result: object) -> Tensor:
 
 def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgram:
     try:
-        return torch.export.export(module, examples, strict=False)
+        program = torch.export.export(module, examples, strict=False)
     except PolicyError:
         raise
     except Exception as error:
         first = str(error).strip().partition("\n")[0]
         if "data-dependent" in first:
-            raise PolicyError(
-                "it decides by the values of a tensor, which a graph cannot"
-            ) from error
+            raise PolicyError(_DECIDES) from error
         raise PolicyError(f"torch.export: {type(error).__name__}: {first}") from error
+    given = program.graph_signature.user_inputs
+    for node in program.graph.find_nodes(op="call_function", target=torch.ops.aten.item.default):
+        read = node.all_input_nodes[0]
+        if read.op != "placeholder" or read.name in given:  # the number of a weight is constant
+            raise PolicyError(_DECIDES)
+    return program
 
 
 def _require_bounded(program: ExportedProgram) -> None:
@@ -183,8 +197,23 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
             yield node.name, stored[target], len(node.users)
 
 
+class _Undecided(TorchFunctionMode):
+    """Raises PolicyError where Python reads a tensor's value; what TorchScript reads is kept."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        is_list = func is torch.as_tensor and isinstance(args[0], list)
+        copied = tree_leaves((args, kwargs)) if is_list or func is torch.tensor else []
+        if any(isinstance(each, Tensor) for each in copied) or func.__name__ in _READS:
+            raise PolicyError(_DECIDES)
+        return func(*args, **(kwargs or {}))
+
+
 def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
     """Return a digest, as ``_digest``, of a module that calls TorchScript."""
+    with _Undecided():
+        module(*examples)
     graph = _traced(module, examples).inlined_graph
     operations = sum(1 for _ in graph.nodes())
     if operations > MAX_SCRIPT_OPERATIONS:

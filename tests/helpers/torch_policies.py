@@ -87,8 +87,26 @@ class Counting(TwoRates):
 
 class Deciding(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
+        chunk = TwoRates.predict_fast(self, feature, state, history, steps)
         return chunk if state[0, 2] < 100 else -chunk
+
+
+class Reading(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1)
+
+
+class Scripted(TwoRates):
+    """Python around an encoder in TorchScript."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.visual_encoder = torch.jit.script(self.visual_encoder)
+
+
+class ScriptedDeciding(Scripted):
+    predict_fast = Deciding.predict_fast
 
 
 class Drawing(TwoRates):

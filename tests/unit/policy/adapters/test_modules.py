@@ -38,6 +38,7 @@ horizon = 8
         ("Wide", False),
         ("TwoRates", True),
         ("PlainClass", False),
+        ("Scripted", True),
         ("Stepwise", True),
         ("Stepwise", False),
     ],

@@ -38,6 +38,7 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
@@ -45,6 +46,8 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("Drawing", "the same inputs do not give the same chunk again"),
         ("Resetting", "the policy has reset"),
         ("Deciding", "it decides by the values of a tensor"),
+        ("Reading", "it decides by the values of a tensor"),
+        ("ScriptedDeciding", "it decides by the values of a tensor"),
         ("Looping", "its graph has 1.. operations, and at most 90"),
     ],
 )
