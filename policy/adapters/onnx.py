@@ -221,6 +221,15 @@ class GraphFile:
         for port, role in zip(model.inputs, self.roles, strict=True):
             scalar = role == "timestep" and port.get_partial_shape().rank == ov.Dimension(0)
             shapes[port] = [] if scalar else list(wanted[role])
+            declared = port.get_partial_shape()
+            sizes = list(declared) if declared.rank.is_static else []
+            axes = zip(reversed(sizes), reversed(shapes[port][1:]), strict=False)  # no batch
+            if any(axis.is_static and axis.get_length() != size for axis, size in axes):
+                raise CheckpointError(
+                    f"{self._path}: its {role} is {declared}, and by the contract {shapes[port]}: "
+                    "set image_height, image_width, history_len, horizon or [state] names to the "
+                    "file's sizes, or export it with the contract's (channels first)"
+                )
         try:
             model.reshape(shapes)
             process = ov.preprocess.PrePostProcessor(model)

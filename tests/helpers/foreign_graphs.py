@@ -111,14 +111,15 @@ def recurrent(path: Path, *, hidden: Sequence[str] = ("h_in", "h_out")) -> None:
     )
 
 
-def image_actor(path: Path, *, kind: int = FLOAT) -> None:
-    """Write a policy: image [1, 3, 32, 32] of any type -> actions [1, 4], the mean pixel value."""
+def image_actor(
+    path: Path, *, kind: int = FLOAT, shape: Shape = (1, 3, IMAGE_PX, IMAGE_PX)
+) -> None:
+    """Write a policy: image of any type and shape -> actions [1, 4], the mean pixel value."""
     nodes = [
         helper.make_node("Cast", ["image"], ["pixels"], to=FLOAT),
         helper.make_node("ReduceMean", ["pixels"], ["mean"], keepdims=0),
         helper.make_node("Mul", ["unit", "mean"], ["actions"]),
     ]
-    shape = (1, 3, IMAGE_PX, IMAGE_PX)
     weights = {"unit": np.ones((1, 4), np.float32)}
     save_graph(path, nodes, {"image": (kind, shape)}, {"actions": (FLOAT, (1, 4))}, weights)
 

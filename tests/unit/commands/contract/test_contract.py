@@ -173,6 +173,10 @@ def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
             lambda folder: (checkpoint(folder) / "mavbridge.toml").symlink_to("../victim"),
             "is there already",
         ),
+        (
+            lambda folder: (folder.mkdir(), graph(folder / "policy.onnx", channels_last=True)),
+            "input rgb_front of policy.onnx has its channels last",
+        ),
     ],
 )
 def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
@@ -186,12 +190,12 @@ def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def graph(path: Path, height: int | str = 96) -> Path:
+def graph(path: Path, height: int | str = 96, *, channels_last: bool = False) -> Path:
     """Takes what a policy takes, and gives a constant chunk of 8 actions."""
     onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
     helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
     shapes = {
-        "rgb_front": [1, 3, height, 128],
+        "rgb_front": [1, height, 128, 3] if channels_last else [1, 3, height, 128],
         "robot_state": [1, 2],
         "action_history": [1, 4, 4],
     }

@@ -307,7 +307,15 @@ REFUSED: dict[str, tuple[Write, str]] = {
     ),
     "state of another width": (
         lambda folder: graphs.actor(folder / "policy.onnx", state_dim=17),
-        r"takes \['\[1,17\]'\].*\[1, 13\]",
+        r"its state is \[1,17\], and by the contract \[1, 13\]: set .*\[state\] names",
+    ),
+    "image of another size": (
+        lambda folder: graphs.image_actor(folder / "policy.onnx", shape=(1, 3, 64, 64)),
+        r"its image is \[1,3,64,64\], and by the contract \[1, 3, 32, 32\]: set image_height",
+    ),
+    "channels last": (
+        lambda folder: graphs.image_actor(folder / "policy.onnx", shape=(1, 32, 32, 3)),
+        r"its image is \[1,32,32,3\].*export it .*channels first",
     ),
     "hidden of another shape": (
         lambda folder: [
