@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -46,29 +47,30 @@ def adopt_modules(
     if encoder is None and head is None and denoiser is None:
         if not _has_forward(holder):
             return None
-        call = _Call(name, holder, "chunk", picks)
+        call = _Call(name, holder, "chunk", picks, ("image", "state", "action_history"))
         call.skip = int(_takes_no_image(call, interface, description.inputs.get("state")))
-        call.require_order("image", "state", "action_history")
+        call.require_order()
         return _owned(ForwardPolicy(interface, call), holder, modules)
     if encoder is None or (head is None) == (denoiser is None):
         raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
     for module in modules:
         module.eval()
-    features = _Call(name, encoder, "feature", picks)
+    features = _Call(name, encoder, "feature", picks, ("image",))
 
     def encode(image: Tensor) -> Tensor:
         return features(image).flatten(1)
 
     interface = _with_feature(name, encode, interface)
     if head is not None:
-        call = _Call(name, head, "chunk", picks)
-        call.require_order("feature", "state", "action_history")
+        call = _Call(name, head, "chunk", picks, ("feature", "state", "action_history"))
+        call.require_order()
         return _owned(HeadPolicy(interface, encode, call), holder, modules)
     schedule = getattr(holder, "noise_schedule", None) or NoiseSchedule()
     if description.schedule:
         schedule = make_schedule(name, description.schedule)
-    call = _Call(name, denoiser, "prediction", picks)
-    call.require_order("noisy", "timestep", "feature", "state", "action_history")
+    roles = ("noisy", "timestep", "feature", "state", "action_history")
+    call = _Call(name, denoiser, "prediction", picks, roles)
+    call.require_order()
     return _owned(DenoiserPolicy(interface, encode, call, schedule, seed), holder, modules)
 
 
@@ -246,27 +248,44 @@ class _Call:
     """Module or function that is passed as many arguments as it declares and returns one tensor."""
 
     def __init__(
-        self, name: str, function: Any, result: str, outputs: Mapping[str, str | int]
+        self,
+        name: str,
+        function: Any,
+        result: str,
+        outputs: Mapping[str, str | int],
+        roles: Sequence[str],
     ) -> None:
-        """Prepare the calls; ``outputs[result]`` selects the result among several values."""
-        self._name, self._function = name, function
+        """Prepare the calls, with arguments of these roles.
+
+        ``outputs[result]`` selects the result among several values. An argument with a number or
+        text as its default is a setting and keeps it, with all after it, unless it is named as a
+        role.
+        """
+        self._name, self._function, self._roles = name, function, roles
         self._result, self._pick = result, outputs.get(result)
         self.skip = 0
         """Leading arguments to drop: 1 for a policy that takes no image."""
-        self.names: list[str]
         called = function.forward if isinstance(function, nn.Module) else function
         schema = getattr(called, "schema", None)  # of TorchScript
+        takes_any = False
         if schema is not None:
-            self.names = [each.name for each in schema.arguments[1:]]  # without self
-            self._count = len(self.names)
-            return
-        parameters = inspect.signature(called).parameters
-        self.names = list(parameters)
-        takes_any = any(each.kind is each.VAR_POSITIONAL for each in parameters.values())
-        self._count = sys.maxsize if takes_any else len(parameters)
+            declared = [(each.name, each.default_value) for each in schema.arguments[1:]]
+        else:
+            parameters = inspect.signature(called).parameters.values()
+            takes_any = any(each.kind is each.VAR_POSITIONAL for each in parameters)
+            by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+            declared = [(each.name, each.default) for each in parameters if each.kind in by_place]
+        usual = {name for role in roles for name in USUAL_NAMES[role]}
+        given = takewhile(
+            lambda each: each[0] in usual or not isinstance(each[1], int | float | str), declared
+        )
+        self.names = [name for name, _ in given]
+        takes_all = takes_any and len(self.names) == len(declared)
+        self._count = sys.maxsize if takes_all else len(self.names)
 
-    def require_order(self, *roles: str) -> None:
+    def require_order(self) -> None:
         """Raise PolicyError if an argument has the usual name of another role than its own."""
+        roles = self._roles
         places = {name: at for at, role in enumerate(roles) for name in USUAL_NAMES[role]}
         for at, name in enumerate(self.names, self.skip):
             if places.get(name, at) != at:

@@ -174,6 +174,15 @@ class ForwardOnly(nn.Module):
         return chunk.reshape(-1, SINGLE.horizon, 4)
 
 
+class Settable(ForwardOnly):
+    """Settings behind the arguments, which keep their defaults."""
+
+    def forward(
+        self, image: Tensor, state: Tensor, scale: float = 1.0, *, offset: float = 0.0
+    ) -> Tensor:
+        return super().forward(image, state) * scale + offset
+
+
 class NamedHead:
     """Neither module nor methods: two modules by name."""
 

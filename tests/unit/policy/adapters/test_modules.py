@@ -125,6 +125,21 @@ def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     assert [act(runner, vx_mps=vx)[0, 0] for vx in (1.0, -1.0)] == [0.5, 0.0]
 
 
+class Settable(nn.Module):
+    def forward(self, state: torch.Tensor, sample: bool = False) -> torch.Tensor:
+        return torch.full((1, 8, 4), float(sample)) + state.sum()
+
+
+def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
+    plain, settable = (
+        load(f"{MINE}:{name}", dual_rate=False).runner for name in ("ForwardOnly", "Settable")
+    )
+    require_same(plain, settable)
+    path = archive(tmp_path, Settable(), described())
+    runner = load(f"torchscript:{path}", dual_rate=False).runner
+    assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(act(runner)[0, 0] + 0.5, abs=1e-3)
+
+
 class StateFirst(nn.Module):
     def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         return torch.zeros(1, 8, 4) + state.mean() + image.mean()
