@@ -4,8 +4,14 @@ And what a user's policy holds: its modules, and the attributes that change from
 """
 
 import copy
-from collections.abc import Callable, Collection, Sequence
+import hashlib
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from io import IOBase
+from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -18,6 +24,12 @@ from policy.protocol import PolicyRunner, SingleRatePolicy
 
 WARM_UP_CALLS = 3
 """Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
+MAX_HELD = 10_000
+"""Largest number of objects that are searched for a policy's modules and memory."""
+_OPENED = (list, tuple, dict, SimpleNamespace, nn.Module)
+"""Types that are searched beside those of packages outside ``_LIBRARIES``."""
+_LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
+_OF_TORCH = frozenset(vars(nn.Module()))
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
@@ -109,49 +121,75 @@ class _Graph:
 
 
 def modules_of(policy: object) -> list[nn.Module]:
-    """Return the policy itself if it is a module, else the modules among its attributes."""
-    if isinstance(policy, nn.Module):
-        return [policy]
-    values = vars(policy).values() if hasattr(policy, "__dict__") else ()
-    return [value for value in values if isinstance(value, nn.Module)]
+    """Return the modules that a policy is or holds, except those inside another module."""
+    modules = [held for _, held in _held_by(policy) if isinstance(held, nn.Module)]
+    inner = {id(child) for module in modules for child in module.modules() if child is not module}
+    return [module for module in modules if id(module) not in inner]
 
 
 def snapshot(policy: object) -> dict[str, object]:
-    """Return the attributes of a policy and of all its modules, by name, in a comparable form.
+    """Return the attributes of a policy and of all that it holds, by name, in a comparable form.
 
     Tensors are compared by value, except the weights, which no forward call changes; numpy arrays,
-    numbers and texts by value; collections by the identity of their elements; other objects by
-    identity.
+    numbers and texts by value; collections by the identity of their elements; iterators never
+    compare equal; other objects by identity.
     """
-    holders: dict[str, object] = {"": policy}
-    for at, module in enumerate(modules_of(policy)):
-        holders |= {f"{at}.{name}.": child for name, child in module.named_modules() if name}
-        holders[f"{at}."] = module
-    marks: dict[str, object] = {}
-    for path, holder in holders.items():
-        attributes = dict(vars(holder)) if hasattr(holder, "__dict__") else {}
-        attributes |= attributes.pop("_buffers", {})
-        attributes.pop("_parameters", None)
-        marks |= {f"{path}{name}": _mark(value) for name, value in attributes.items()}
-    return marks
+    held = [(path, _attributes(holder)) for path, holder in _held_by(policy)]
+    return {path + name: _mark(value) for path, inside in held for name, value in inside.items()}
+
+
+def _held_by(policy: object) -> list[tuple[str, object]]:
+    """Return the policy and, with their paths, the modules, collections and objects below it."""
+    held, seen = [("", policy)], {id(policy)}
+    for path, holder in held:  # grows
+        for name, value in _attributes(holder).items():
+            is_open = isinstance(value, _OPENED) or _is_of_user(type(value))
+            if is_open and id(value) not in seen and len(held) < MAX_HELD:
+                seen.add(id(value))
+                held.append((path + name, value))
+    return held
+
+
+def _is_of_user(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] not in _LIBRARIES
+
+
+def _attributes(holder: object) -> dict[str, object]:
+    """Return the elements of a collection, or the attributes of an object and of its class."""
+    if isinstance(holder, list | tuple | dict):
+        items = holder.items() if isinstance(holder, dict) else enumerate(holder)
+        return {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
+    attributes: dict[str, object] = {}
+    for kind in filter(_is_of_user, reversed(type(holder).__mro__)):
+        attributes |= vars(kind)
+    attributes |= getattr(holder, "__dict__", {})
+    if isinstance(holder, nn.Module):
+        attributes = {name: each for name, each in attributes.items() if name not in _OF_TORCH}
+        attributes |= {**dict(holder.named_buffers(recurse=False)), **dict(holder.named_children())}
+    return {f".{name}": value for name, value in attributes.items()}
 
 
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
     """Return the names, without the path, of attributes that were added, removed or changed."""
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return sorted({name.rpartition(".")[2] for name in names})
+    return sorted({name.rpartition(".")[2].partition("[")[0] for name in names})
 
 
 def _mark(value: object) -> object:
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor) and value.layout is torch.strided and not value.is_meta:
         array = value.detach().cpu().contiguous()
-        return str(array.dtype), tuple(array.shape), array.float().numpy().tobytes()
+        digest = hashlib.sha256(array.float().numpy().tobytes()).digest()
+        return str(array.dtype), tuple(array.shape), digest
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
-    if value is None or isinstance(value, bool | int | float | str | bytes):
+    if value is None or isinstance(value, bool | int | str | bytes):
         return value
+    if isinstance(value, float):
+        return repr(value)  # NaN equals itself
     if isinstance(value, dict):
         return tuple((id(key), id(element)) for key, element in value.items())
-    if isinstance(value, Collection):
+    if isinstance(value, list | tuple | set | frozenset | deque):
         return tuple(map(id, value))
+    if isinstance(value, Iterator) and not isinstance(value, IOBase):
+        return object()
     return id(value)

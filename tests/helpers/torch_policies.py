@@ -1,5 +1,7 @@
 """Torch policies as a user might write them, small and untrained."""
 
+import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -77,11 +79,43 @@ class PlainClass:
         self.gain, self.mean = np.array(0.5), np.zeros(13)  # constants, not memory
 
 
+class Listed(PlainClass):
+    """Holds a module in a list, and one in TorchScript."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heads, self.visual_encoder = [self.head], torch.jit.script(self.visual_encoder)
+        del self.head
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return torch.as_tensor(self.heads[0](feature, state, history))
+
+
 class Counting(TwoRates):
     calls = 0
 
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         self.calls += 1
+        return super().predict_fast(feature, state, history, steps)
+
+
+class CountingInClass(TwoRates):
+    calls = 0
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        CountingInClass.calls += 1
+        return super().predict_fast(feature, state, history, steps)
+
+
+class CountingBelow(TwoRates):
+    """Its memory is an object in a list, and an iterator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.phases, self.clock = [SimpleNamespace(calls=0)], itertools.count()
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        self.phases[0].calls = next(self.clock)
         return super().predict_fast(feature, state, history, steps)
 
 

@@ -39,6 +39,7 @@ horizon = 8
         ("TwoRates", True),
         ("PlainClass", False),
         ("Scripted", True),
+        ("Listed", True),
         ("Stepwise", True),
         ("Stepwise", False),
     ],
