@@ -4,6 +4,7 @@
 ``mavbridge``.
 """
 
+import sysconfig
 import threading
 import traceback
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _OURS = Path(__file__).parent
+_LIBRARIES = {Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")}
 _WARNING = "warning: "
 
 
@@ -85,10 +87,13 @@ def user_code(doing: str) -> Iterator[None]:
 
 
 def user_line(error: BaseException) -> str:
-    """Return " (file:line)" of the user's innermost line that raised; empty if none did."""
-    theirs = [
+    """Return " (file:line)" of the user's innermost line that raised, else of a library's."""
+    foreign = [
         frame
         for frame in traceback.extract_tb(error.__traceback__)
         if not frame.filename.startswith("<") and _OURS not in Path(frame.filename).parents
     ]
+    theirs = [
+        frame for frame in foreign if _LIBRARIES.isdisjoint(Path(frame.filename).parents)
+    ] or foreign
     return f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""

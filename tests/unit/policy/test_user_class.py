@@ -186,6 +186,11 @@ class FailsTwice(FailsToClose):
         raise RuntimeError("no weights")
 
 
+class FailsInALibrary(Single):
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return torch.nn.Linear(2, 2)(torch.zeros(3))
+
+
 class NoContract:
     predict = Single.predict
 
@@ -279,6 +284,7 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
         ("NoFeatureDim", {}, "needs feature_dim"),
         ("ResetNeedsMore", {}, "failed to reset: TypeError: .*missing 1 required .*'seed'"),
         ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
+        ("FailsInALibrary", {}, r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)"),
         ("NeedsMore", {}, r"cannot be made with Class\(\)"),
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
         ("Single", {"image_size": 64}, "takes 32x32"),
