@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from types import ModuleType
+from types import MethodType, ModuleType
 
 from policy.adapters.description import Description
 from policy.adapters.interface import Interface
@@ -159,15 +159,6 @@ def _import_hint(error: BaseException | None) -> str:
     return "mend that line"
 
 
-def _with_predict(found: type) -> type:
-    """Return the class, with a ``predict`` made of its fast pair if it has that pair alone."""
-    has_pair = all(callable(getattr(found, name, None)) for name in _FAST_PAIR)
-    if not has_pair or getattr(found, "predict", None) is not None:
-        return found
-    members = {"predict": predict_by_pair, "__module__": found.__module__}
-    return type(found.__name__, (found,), members)
-
-
 def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
     arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
     try:
@@ -179,7 +170,11 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
             "checkpoint of --checkpoint, if that is given"
         ) from error
     with user_code(f"--policy {spec}: making it failed"):
-        policy: object = _with_predict(found)(**arguments)
+        policy: object = found(**arguments)
+        has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
+        if has_pair and getattr(policy, "predict", None) is None:
+            # Of object: a frozen dataclass has no setattr.
+            object.__setattr__(policy, "predict", MethodType(predict_by_pair, policy))
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch

@@ -91,6 +91,19 @@ class Listed(PlainClass):
         return torch.as_tensor(self.heads[0](feature, state, history))
 
 
+class ModuleAsMethod(nn.Module):
+    """The fast pair alone, one of it a module."""
+
+    contract = DUAL
+
+    def __init__(self) -> None:
+        super().__init__()
+        whole = TwoRates()
+        self.encode_visual, self.head = whole.visual_encoder, whole.head
+
+    predict_fast: Any = TwoRates.predict_fast
+
+
 class Counting(TwoRates):
     calls = 0
 

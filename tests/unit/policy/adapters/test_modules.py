@@ -40,6 +40,7 @@ horizon = 8
         ("PlainClass", False),
         ("Scripted", True),
         ("Listed", True),
+        ("ModuleAsMethod", False),
         ("Stepwise", True),
         ("Stepwise", False),
     ],
