@@ -18,6 +18,8 @@ from policy.files import parse_object
 
 CONTRACT_VERSION, OLDEST_VERSION = 6, 4
 """Version of contracts that are written, and the oldest version that can be read."""
+CONTRACT_FILE = "mavbridge.toml"
+"""File name of a contract beside a policy or dataset, where flights find it without --contract."""
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -105,6 +107,11 @@ _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "ma
 LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
 FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", "stops_at_end", *LIMIT_TERMS)
 """Fields that decide how a policy is flown and do not affect its network's output."""
+STICK_TERMS = (
+    *("modes", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
+    *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
+)
+"""Fields that decide what a stick does; recorded sticks mean nothing without them."""
 _INTEGERS = {
     "image_height": (16, 4096),
     "image_width": (16, 4096),

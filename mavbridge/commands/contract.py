@@ -15,8 +15,9 @@ from policy.adapters.drafts import (
     onnx_entries,
     onnx_files,
 )
-from policy.adapters.interface import CONTRACT_FILE, UNANSWERED
+from policy.adapters.interface import UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE
+from policy.contract import CONTRACT_FILE
 from policy.data.lerobot import is_lerobot
 
 

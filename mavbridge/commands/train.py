@@ -12,7 +12,7 @@ from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from policy.contract import Contract
+from policy.contract import STICK_TERMS, Contract
 from policy.data.flight_data import DatasetError, FlightData, common_contract
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
@@ -72,8 +72,9 @@ def fit_to_flights(
         stops_at_end=flown.stops_at_end,
     )
     if flown.action == "rates":
-        contract = rates_contract(contract)
-    return replace(network, contract=contract)
+        return replace(network, contract=rates_contract(contract))
+    terms = {name: getattr(flown, name) for name in STICK_TERMS}
+    return replace(network, contract=replace(contract, **terms))
 
 
 def _show(bar: Progress, task: TaskID, progress: TrainingProgress) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
-from policy.contract import Contract
+from policy.adapters.interface import Interface, read_interface
+from policy.contract import CONTRACT_FILE, Contract
 from policy.errors import CheckpointError, PolicyError
 from policy.files import last_line, parse_json, read_text, stand_in, why_unreadable
 

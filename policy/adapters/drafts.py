@@ -20,6 +20,7 @@ from policy.contract import (
     IMAGENET_STD_RGB,
     LIMIT_TERMS,
     STATE_NAMES,
+    STICK_TERMS,
     Contract,
 )
 from policy.data.lerobot_format import (
@@ -56,11 +57,6 @@ _SPELLINGS: Mapping[str, Sequence[str]] = {
     "yaw_rad": ("yaw", "heading"),
 }
 """Common spellings of state names in other projects; their units are guessed."""
-_STICKS = (
-    *("modes", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
-    *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
-)
-"""Terms of recorded flights that go into every draft."""
 
 
 class Entry(NamedTuple):
@@ -293,13 +289,13 @@ def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
     """
     usual = json.loads(Contract().to_json())
     entries = []
-    for name in (*_STICKS, *LIMIT_TERMS):
+    for name in (*STICK_TERMS, *LIMIT_TERMS):
         found = sorted({json.dumps(each.get(name, usual[name])) for each in contracts})
         value = json.loads(found[0]) if found else usual[name]
         if len(found) > 1:
             why = f"the flights were flown with different ones: {', '.join(found)}"
             entries.append(Entry("contract", name, UNANSWERED, why))
-        elif name in _STICKS or value != usual[name]:
+        elif name in STICK_TERMS or value != usual[name]:
             entries.append(Entry("contract", name, value, "as the flights were flown"))
     return entries
 

@@ -20,8 +20,6 @@ from policy.files import read_toml
 from policy.motion.rotation import matrix_columns
 from policy.preprocess import egocentric_columns
 
-CONTRACT_FILE = "mavbridge.toml"
-"""File name of a contract beside a policy or dataset, where flights find it without --contract."""
 UNANSWERED = "?"
 """Value in a contract file that the user has to replace."""
 

@@ -5,11 +5,12 @@ All data keep their own timestamps, so the rates of camera, telemetry and sticks
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import QUATERNION, STATE_NAMES, Contract, FloatArray
+from policy.contract import QUATERNION, STATE_NAMES, STICK_TERMS, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.preprocess import STATE_SCALE
 
@@ -58,7 +59,8 @@ class FlightData:
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
     contract: Contract
-    """Contract by which it was flown; of a foreign dataset, only the state's frame is known."""
+    """Contract by which it was flown; of a dataset, the state's frame and
+    ``STICK_TERMS``, by default those of ``Contract``."""
     course_seed: int | None = None
     """Seed of the simulated course; its flights are held out together. None: unknown."""
     damage: tuple[str, ...] = ()
@@ -94,23 +96,18 @@ class FlightData:
 
 
 def common_contract(flights: Sequence[FlightData]) -> Contract:
-    """Return the contract of flights of one state frame, action and hover thrust.
+    """Return the contract of flights of one state frame and one meaning of the action.
 
     It has the largest of their tilts, and stops at the end if all flights do.
     """
     first, name = flights[0].contract, flights[0].name
-    for flight in flights:
-        contract = flight.contract
-        if contract.state_frame != first.state_frame:
+    stick_terms = STICK_TERMS if first.action == "sticks" else ()
+    terms = ("state_frame", "action", "hover_thrust", *stick_terms)
+    for flight, term in product(flights, terms):
+        if (here := getattr(first, term)) != (there := getattr(flight.contract, term)):
             raise DatasetError(
-                f"{name} holds its state in {first.state_frame}, {flight.name} in "
-                f"{contract.state_frame}: train on one kind at a time"
-            )
-        if (contract.action, contract.hover_thrust) != (first.action, first.hover_thrust):
-            raise DatasetError(
-                f"{name} was flown by {first.action} and hovers at a thrust of "
-                f"{first.hover_thrust:g}, {flight.name} by {contract.action} at "
-                f"{contract.hover_thrust:g}: train on one kind at a time"
+                f"{name} was flown by a contract with {term} {here}, {flight.name} with {there}: "
+                "train on one kind at a time"
             )
     contracts = [flight.contract for flight in flights]
     tilts_deg = [each.max_tilt_deg for each in contracts if each.max_tilt_deg is not None]

@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -18,9 +18,11 @@ from av.video.reformatter import VideoReformatter
 
 from policy.contract import (
     ACTION_NAMES,
+    CONTRACT_FILE,
     NS_PER_S,
     SPECIFIC_FORCE,
     STATE_NAMES,
+    STICK_TERMS,
     Contract,
     FloatArray,
     StateFrame,
@@ -29,7 +31,8 @@ from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
 from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
-from policy.files import library_name, read_object, why_unreadable
+from policy.errors import ContractError
+from policy.files import library_name, read_object, read_toml, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
 """Path templates: fields with these names, a few digits wide."""
@@ -84,6 +87,8 @@ class _Info:
     video_path: str
     camera: str
     is_video: bool
+    contract: Contract
+    """With ``STICK_TERMS`` alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +132,22 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
         video_path=str(data.get("video_path") or names.VIDEO),
         camera=camera,
         is_video=features[camera].get("dtype") == "video",
+        contract=_stick_contract(folder / CONTRACT_FILE),
     )
+
+
+def _stick_contract(path: Path) -> Contract:
+    """Return the defaults with the ``STICK_TERMS`` of a dataset's contract file, if there is one.
+
+    An open question among its other entries does not matter.
+    """
+    try:
+        said = read_toml(path).get("contract", {})
+        return Contract.from_fields({name: said[name] for name in STICK_TERMS if name in said})
+    except FileNotFoundError:
+        return Contract()
+    except (OSError, ValueError, TypeError, ContractError) as error:
+        raise DatasetError(f"{path} does not say what its sticks did: {error}") from error
 
 
 def _require_vector(
@@ -258,7 +278,7 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
     action = whole(names.ACTION_KEY, len(ACTION_NAMES))
     return FlightData(
         name=row.name,
-        contract=Contract(state_frame=_state_frame(info, row, state)),
+        contract=replace(info.contract, state_frame=_state_frame(info, row, state)),
         tick_ns=at(names.TICK),
         state=state,
         attitude_ns=at(names.ATTITUDE),

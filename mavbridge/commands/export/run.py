@@ -23,8 +23,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
-from policy.adapters.interface import BODY_STATE_NAMES, CONTRACT_FILE
-from policy.contract import ACTION_DIM, STATE_NAMES
+from policy.adapters.interface import BODY_STATE_NAMES
+from policy.contract import ACTION_DIM, CONTRACT_FILE, STATE_NAMES
 from policy.data import lerobot_format as names
 from policy.data.flight_data import (
     DatasetError,

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
+from policy.adapters.interface import Interface, read_interface
 from policy.adapters.lerobot.config import Config, Features, read_config, read_json
-from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.contract import ACTION_DIM, CONTRACT_FILE, Contract, FloatArray
 from policy.data.lerobot_format import ACTION_KEY, STATE_KEY
 from policy.errors import CheckpointError, ContractError, warned
 from policy.files import open_safetensors

@@ -61,19 +61,25 @@ def test_the_contract_file_has_the_flights_rate_and_terms(tmp_path: Path) -> Non
         image_keys=("observation.images.front",),
         prompt="race",
     )
+    (back,) = read_dataset(out)
+    assert back.contract == replace(contract, max_feature_age_s=USUAL.max_feature_age_s)
+    entries = (out / "mavbridge.toml").read_text()
+    (out / "mavbridge.toml").write_text(entries.replace("lean_deg = 45.0", 'lean_deg = "?"'))
+    with pytest.raises(DatasetError, match=r"mavbridge\.toml .*: full_lean_deg must be in .*'\?'"):
+        read_dataset(out)
 
 
 def test_terms_in_which_flights_differ_are_asked_of_the_user(tmp_path: Path) -> None:
     flights = [
-        flight(tmp_path / "a", Contract(full_lean_deg=45.0)),
+        flight(tmp_path / "a", Contract(max_height_m=45.0)),
         flight(tmp_path / "b", Contract(max_tilt_deg=50.0)),
     ]
     out = exported(flights, tmp_path / "out") / "mavbridge.toml"
     with pytest.raises(
-        ContractError, match=r"2 answers are missing: \[contract\] full_lean_deg, .* max_tilt_deg\."
+        ContractError, match=r"2 answers are missing: \[contract\] max_tilt_deg, .* max_height_m\."
     ):
         read_interface(out)
-    assert "different ones: 30.0, 45.0" in out.read_text()
+    assert "different ones: 45.0, null" in out.read_text()
 
 
 def test_a_state_in_body_axes_is_what_the_policy_gets_in_flight(tmp_path: Path) -> None:

@@ -98,11 +98,14 @@ def test_ctrl_c_keeps_the_best_weights_and_says_so(
     assert out.is_file()
 
 
-def test_the_policy_takes_the_frame_of_the_flights(tmp_path: Path) -> None:
+def test_the_policy_takes_frame_and_sticks_of_the_flights(tmp_path: Path) -> None:
     folder = write_spot_flight(tmp_path / "a", 0, seconds=0.3)
-    write_meta(folder, contract={"state_frame": "enu_flu"})
+    sticks = {"modes": ["LOITER"], "full_lean_deg": 45.0, "throttle_dead_zone": 0.0}
+    write_meta(folder, contract={"state_frame": "enu_flu", **sticks})
     settings = TrainSettings(out=tmp_path / "a.safetensors", since_exposure=False)
     network = TogeConfig(backbone="resnet8", contract=Contract(since_exposure=True))
     made = run.fit_to_flights(network, [read_flight(folder)], settings)
     assert made.contract.state_frame == "enu_flu"
+    assert made.contract.modes == ("LOITER",)
+    assert (made.contract.full_lean_deg, made.contract.throttle_dead_zone) == (45.0, 0.0)
     assert not made.contract.since_exposure
