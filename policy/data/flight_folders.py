@@ -60,7 +60,7 @@ def failure_of(folder: Path) -> str | None:
 
     ``success`` decides if it is set; else a crash, a fault that ended the flight, or the end of its
     process. A hit of a gate's frame counts as a failure. A policy's flight that an expert labelled
-    ("dagger") is used however it ended.
+    ("dagger") is used however it ended, and one that a pilot corrected although it missed gates.
     """
     meta = _read_meta(folder)
     outcome = meta.get("outcome")
@@ -76,9 +76,17 @@ def failure_of(folder: Path) -> str | None:
         return "ended by a fault"
     if source == "flight" and meta.get("finished") is False:
         return "cut off"
-    if success is False:
-        return "marked as bad" if source == "pilot" else "off the course"
-    return None
+    if success is False and source == "pilot":
+        return "marked as bad"
+    return "off the course" if success is False and not _is_corrected(folder, meta) else None
+
+
+def _is_corrected(folder: Path, meta: Mapping[str, object]) -> bool:
+    try:
+        ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, [])
+        return bool(_corrections(ticks, _contract(str(folder), meta)).any())
+    except DatasetError:
+        return False
 
 
 def leave_out_failed(
@@ -130,7 +138,7 @@ def read_flight(folder: Path) -> FlightData:
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
     tick_ns, sent_ns = _decisions(name, ticks), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
-    sent, target, is_target = _sticks(name, meta, ticks, contract)
+    sent, target, is_target = _sticks(name, ticks, contract)
     # The expert observed at the policy's tick; its stick is for that time.
     target_ns = stamps(name, ticks, "woke_ns") if "expert" in ticks.column_names else sent_ns
     if contract.action == "rates":
@@ -159,20 +167,20 @@ def read_flight(folder: Path) -> FlightData:
 
 
 def _sticks(
-    name: str, meta: Mapping[str, object], ticks: pa.Table, contract: Contract
+    name: str, ticks: pa.Table, contract: Contract
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
     sent = _sent(name, ticks, contract)
     is_expert = "expert" in ticks.column_names
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array([armed is True for armed in ticks["armed"].to_pylist()])
-    is_in_mode = np.isin(ticks["mode"].to_pylist(), contract.modes)
-    is_correction = is_in_mode & _corrections(meta, ticks, contract)
+    is_correction = _corrections(ticks, contract)
     if not is_expert and is_correction.any():
         sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
         target, is_target = sent, is_correction
     elif not is_expert:
         is_policys = ticks["sent"].null_count < ticks.num_rows
+        is_in_mode = np.isin(ticks["mode"].to_pylist(), contract.modes)
         is_target &= np.array(ticks["phase"]) == "flying" if is_policys else is_in_mode
     if not is_target.any():
         raise DatasetError(
@@ -195,23 +203,21 @@ def _sent(name: str, ticks: pa.Table, contract: Contract) -> FloatArray:
     return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
 
 
-def _corrections(
-    meta: Mapping[str, object], ticks: pa.Table, contract: Contract
-) -> NDArray[np.bool_]:
-    """Return the ticks in which a pilot flew on after taking over from the policy by the sticks."""
-    outcome = meta.get("outcome")
-    is_takeover = isinstance(outcome, dict) and outcome.get("end") == "takeover"
-    if not is_takeover or contract.action != "sticks":
-        return np.zeros(ticks.num_rows, bool)
-    names = ("phase", "armed", "sent", "rc_sticks")
+def _corrections(ticks: pa.Table, contract: Contract) -> NDArray[np.bool_]:
+    """Return the ticks in which a pilot flew on after taking over from the policy by the sticks.
+
+    In a takeover alone the sticks are given back straight from "flying".
+    """
+    names = ("phase", "armed", "mode", "sent", "rc_sticks")
     rows = zip(*(ticks[name].to_pylist() for name in names), strict=True)
-    return np.array(
-        [
-            phase == "released" and armed and sent is None and sticks is not None
-            for phase, armed, sent, sticks in rows
-        ],
-        bool,
-    )
+    before, is_taken, out = None, False, []
+    for phase, armed, mode, sent, sticks in rows:
+        is_given_back = phase in ("releasing", "released")
+        is_taken = armed and (is_given_back if before == "flying" else is_taken)
+        is_pilots = phase == "released" and sent is None and sticks is not None
+        out.append(is_taken and is_pilots and mode in contract.modes)
+        before = phase
+    return np.array(out, bool) & (contract.action == "sticks")
 
 
 def read_ages(folder: Path) -> Nanoseconds:

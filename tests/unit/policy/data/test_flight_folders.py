@@ -107,23 +107,41 @@ def test_a_pilots_sticks_are_imitated_in_modes_of_the_contract(tmp_path: Path) -
         read_flight(flight(tmp_path / "b", **pilot, mode=["LOITER"] * 3))
 
 
-@pytest.mark.parametrize("end", ["takeover", "fault"])
-def test_after_a_takeover_the_pilots_sticks_alone_are_imitated(tmp_path: Path, end: str) -> None:
-    pilots = (0.0, 0.0, 0.5, 0.0)
+TAKEN = ["flying", "releasing", "released"]
+
+
+@pytest.mark.parametrize(
+    ("phases", "modes", "corrected"),
+    [
+        (TAKEN, [], [2]),
+        ([*TAKEN, "preparing", "flying", "leaving", "released"], [], [2]),
+        ([*TAKEN, "released", *TAKEN], ["LOITER", *["ALT_HOLD"] * 3], [2, 6]),
+        (["flying", "leaving", "released", *TAKEN], [], [5]),
+        (["flying", "leaving", "released"], [], []),
+        (TAKEN, ["LOITER"], []),
+    ],
+)
+def test_after_a_takeover_the_pilots_sticks_alone_are_imitated(
+    tmp_path: Path, phases: list[str], modes: list[str], corrected: list[int]
+) -> None:
+    pilots, neutral = (0.0, 0.0, 0.5, 0.0), (0.0,) * 4
+    flown = {"flying": STICK, "leaving": neutral}
     folder = flight(
         tmp_path / "a",
-        {"source": "flight", "outcome": {"end": end}},
+        {"source": "flight", "success": False, "outcome": {"end": "signal"}},
+        woke_ns=[at * 10 * MS for at in range(len(phases))],
         expert=None,
-        sent=[STICK, None, None],
-        rc_sticks=[STICK, pilots, pilots],
-        phase=["flying", "released", "released"],
+        sent=[flown.get(phase) for phase in phases],
+        rc_sticks=[pilots] * len(phases),
+        phase=phases,
+        mode=[*["ALT_HOLD"] * (len(phases) - len(modes)), *modes],
     )
+    assert failure_of(folder) == (None if corrected else "off the course")
     episode = read_flight(folder)
-    is_corrected = end == "takeover"
-    assert episode.target_ns.tolist() == (WOKE[1:] if is_corrected else WOKE[:1])
-    np.testing.assert_allclose(episode.target, [pilots] * 2 if is_corrected else [STICK])
-    after = pilots if is_corrected else (0.0,) * 4
-    np.testing.assert_allclose(episode.sent, [STICK, after, after])
+    target = corrected or [at for at, phase in enumerate(phases) if phase == "flying"]
+    assert episode.target_ns.tolist() == [at * 10 * MS for at in target]
+    np.testing.assert_allclose(episode.target, [pilots if corrected else STICK] * len(target))
+    np.testing.assert_allclose([episode.sent[at] for at in corrected], [pilots] * len(corrected))
 
 
 def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_path: Path) -> None:
