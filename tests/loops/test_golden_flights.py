@@ -151,6 +151,18 @@ def test_the_first_chunk_that_flies_was_still_on_its_way_at_the_tick_before(name
     assert compared.first is None
 
 
+def test_keys_of_a_flight_with_arm_are_told_by_its_phases() -> None:
+    source, phases = golden("toge_ardupilot"), ("flying", "released", "flying")
+    waits = {"phase": "waiting", "release_reason": because(Code.NOT_ENGAGED)}
+    middle = len(source.ticks) // 2
+    ticks = [replace(tick, **waits) for tick in source.ticks[:2]]  # type: ignore[arg-type]
+    pairs = zip(source.ticks[middle:], phases, strict=False)
+    ticks += [replace(tick, phase=phase) for tick, phase in pairs]
+    config = replace(source.config, arm=True)
+    steps = replay_guard(replace(source, config=config, ticks=tuple(ticks)))
+    assert [step.act for step in steps] == [None, "release", "engage", None, "engage"]
+
+
 def test_one_bit_of_one_history_is_noticed(
     numpy_runner: PolicyRunner,
 ) -> None:

@@ -146,8 +146,6 @@ def _arrivals(
     A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve,
     but the first one that flies only from its tick on: it may have been on its way before.
     """
-    config = source.config
-    is_called = not (config.arm or config.engage_channel or config.engage_on_arm)
     frame, solves = action_frame(source.contract), iter(source.solves)
     waiting = next(solves, None)
     before: Tick | None = None
@@ -156,7 +154,7 @@ def _arrivals(
         while waiting is not None and _is_seen(waiting, tick, after):
             newest, waiting = waiting, next(solves, None)
         chunk = None if newest is None else chunk_of(newest, frame)
-        yield tick, chunk, _act(before, tick, is_called=is_called), _stop(before, tick)
+        yield tick, chunk, _act(before, tick, is_arm=source.config.arm), _stop(before, tick)
         before = tick
 
 
@@ -167,11 +165,14 @@ def _is_seen(solve: Solve, tick: Tick, after: Tick | None) -> bool:
     return solve.computed_ns <= tick.woke_ns and not is_next
 
 
-def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand | None:
+def _act(before: Tick | None, tick: Tick, *, is_arm: bool) -> OperatorCommand | None:
     """Return the operator's key, derived from a change of phase."""
     was = None if before is None else before.phase
-    if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
-        return "engage"
+    if was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
+        return "engage"  # no other act in a pass in which `--arm` or the engage switch acts
+    is_called_off = is_arm and tick.release_reason == because(Code.NOT_ENGAGED)
+    if is_called_off and was == tick.phase == "waiting":
+        return "release"  # `--arm` waits for the link alone
     is_ended = was in ("preparing", "flying") and tick.phase != was
     if is_ended and tick.release_reason and tick.release_reason.code is Code.OPERATOR:
         return "release"
