@@ -4,6 +4,7 @@ A row holds the data known at the exposure of its image: the newest state measur
 the newest sticks to imitate up to then. Nothing is interpolated; the stamps give the age of each.
 """
 
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -244,29 +245,34 @@ def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[Imag
 def whole_or_nothing(out: Path) -> Iterator[Path]:
     """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
+    An empty folder that is there may be a mounted one, which is not replaced: it gets the contents.
     SIGTERM ends the block as Ctrl-C does, and no folder stays.
 
     Raises:
-        UserError: ``out`` has no name, is not empty, or cannot be written.
+        UserError: ``out`` is not empty, or cannot be written.
     """
-    if not out.name:
-        raise UserError(f"--out {str(out)!r} has no name: name a new folder")
-    part = out.with_name(f"{out.name}.unfinished")
+    place = Path(os.path.realpath(out))
     try:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise UserError(f"--out {out} is there and not empty: name a new folder")
+        is_new = not place.exists()
+        part = place.with_name(f"{place.name}.unfinished") if is_new else place / ".unfinished"
         if part.exists():
             raise UserError(
                 f"{part} is left of an export that was killed, or another one is at work there: "
                 "remove it, or name another --out"
             )
+        if not is_new and (not place.is_dir() or any(place.iterdir())):
+            raise UserError(f"--out {out} is there and not empty: name a new folder")
         part.mkdir(parents=True)
     except OSError as error:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
     terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield part
-        part.rename(out)
+        if is_new:
+            part.rename(place)
+        else:
+            for entry in list(part.iterdir()):
+                entry.rename(place / entry.name)
     except (OSError, FFmpegError) as error:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
     finally:

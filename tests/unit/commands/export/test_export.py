@@ -16,7 +16,7 @@ from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight
 from helpers.lerobot_rules import broken_rules
 from helpers.status import status_of, told_by
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.run import stretches, write_dataset
+from mavbridge.commands.export.run import stretches, whole_or_nothing, write_dataset
 from policy.data import lerobot_format as names
 from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight
@@ -250,3 +250,16 @@ def test_nothing_is_left_of_an_export_that_breaks(
     monkeypatch.setattr(f"mavbridge.commands.export.{name}", act)
     assert status_of("export", flight, "--out", tmp_path / "out") == status
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("name", ["disk", "link"])
+def test_a_folder_that_is_there_is_filled_and_not_replaced(tmp_path: Path, name: str) -> None:
+    """It may be a mounted one."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to("disk")
+    was = (tmp_path / "disk").stat().st_ino
+    with whole_or_nothing(tmp_path / name) as part:
+        (part / "meta").mkdir()
+    assert [entry.name for entry in (tmp_path / "disk").iterdir()] == ["meta"]
+    assert (tmp_path / "disk").stat().st_ino == was
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["disk", "link"]
