@@ -66,7 +66,7 @@ def failure_of(folder: Path) -> str | None:
     outcome = meta.get("outcome")
     outcome = outcome if isinstance(outcome, dict) else {}
     source, success = meta.get("source"), meta.get("success")
-    if meta.get("ticks") == 0:
+    if meta.get("ticks") == 0 or (meta.get("finished") is False and _is_bare(folder)):
         return "empty"
     if source == "dagger" or success is True:
         return None
@@ -79,6 +79,17 @@ def failure_of(folder: Path) -> str | None:
     if success is False and source == "pilot":
         return "marked as bad"
     return "off the course" if success is False and not _is_corrected(folder, meta) else None
+
+
+def _is_bare(folder: Path) -> bool:
+    """True if a recording was cut off before the first rows of one of its tables."""
+    tables = {"ticks": _TICK_COLUMNS, "frames": _FRAME_COLUMNS}
+    try:
+        return not all(
+            read_rows(folder / stem, [], columns)[0].num_rows for stem, columns in tables.items()
+        )
+    except DatasetError:
+        return False
 
 
 def _is_corrected(folder: Path, meta: Mapping[str, object]) -> bool:

@@ -165,6 +165,10 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
     assert note == "left out: 1 of 5 flights that failed (1 empty): nothing was flown"
     with pytest.raises(DatasetError, match="nothing was flown"):
         leave_out_failed([tmp_path / "c"], include_failed=True)
+    write_meta(tmp_path / "c", source="pilot", finished=False, ticks=None)
+    for name in ("ticks", "frames"):  # killed before its first rows
+        (tmp_path / "c" / f"{name}.arrows").touch()
+    assert failure_of(tmp_path / "c") == "empty"
 
 
 def test_no_flights_are_refused(tmp_path: Path) -> None:
