@@ -308,7 +308,8 @@ def _change_std(model: WorldModel, windows: Windows, latents: FeatureStore) -> T
     """Return the spread [T, C, 1, 1] of the change of normalised latents in some windows."""
     context, frames = model.config.context_frames, windows.frames
     rows = torch.from_numpy(latents.read(frames.ravel(), np.zeros(frames.size, bool)))
-    normal = _normalised(model, rows.reshape(*frames.shape, *model.config.latent_shape))
+    rows = rows.to(model.change_std.device).reshape(*frames.shape, *model.config.latent_shape)
+    normal = _normalised(model, rows)
     change = normal[:, context:] - normal[:, context - 1 : context]
     return change.square().mean(dim=(0, 3, 4))[..., None, None].sqrt().clamp_min(MIN_CHANGE_STD)
 

@@ -22,7 +22,12 @@ from policy.nets.world_model.motion import motion_since
 from policy.training.batches import FeatureStore, encode_frames
 from policy.training.report import TrainingProgress, TrainResult, WorldModelValidation
 from policy.training.settings import WorldModelSettings
-from policy.training.world_model_losses import CONTEXT_NOISE, WindowBatches, dynamics_loss
+from policy.training.world_model_losses import (
+    CONTEXT_NOISE,
+    WindowBatches,
+    dynamics_loss,
+    set_scales,
+)
 from policy.training.world_model_run import train_world_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -180,3 +185,12 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
         assert (float(metrics["sticks"]) > 0) == decides
         assert float(metrics["motion"]) > 0
         assert float(metrics["latents"]) > 0
+
+
+def test_scales_are_stored_on_the_device_of_the_model(tmp_path: Path) -> None:
+    """Torch's meta device refuses tensors of another device, as a GPU does."""
+    windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
+    latents = latents_of(91, tmp_path / "latents", mirror=True)
+    model = WorldModel(SMALL_WORLD).to("meta")
+    set_scales(model, windows, latents, mirrors=True)
+    assert model.change_std.is_meta
