@@ -7,8 +7,8 @@ from policy.contract import FloatArray
 from policy.data.flight_data import Nanoseconds
 from policy.motion import rotation
 
-MAX_GAP_NS = 200_000_000
-"""Longest gap between sticks or attitudes to interpolate across."""
+MAX_GAP_NS = 201_000_000
+"""Longest gap between sticks or attitudes to interpolate across: 5 Hz, with rounded stamps."""
 
 Indices = NDArray[np.int64]
 

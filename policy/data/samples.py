@@ -26,7 +26,7 @@ from policy.contract import (
     history_ages_ns,
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
-from policy.data.interpolation import Indices, Interpolator, covered, nearest
+from policy.data.interpolation import MAX_GAP_NS, Indices, Interpolator, covered, nearest
 from policy.motion.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
@@ -96,6 +96,12 @@ class Timeline:
 
         A sample's image age is drawn from ``ages_ns``, which are sorted.
         """
+        gaps_ns = np.concatenate([np.diff(flight.target_ns) for flight in flights])
+        if len(gaps_ns) and (gap_ns := np.median(gaps_ns)) > MAX_GAP_NS:
+            raise DatasetError(
+                f"{flights[0].name}: actions are {gap_ns / 1e6:.0f} ms apart, and a chunk is "
+                "learned from 5 or more a second: record at a higher rate"
+            )
         self.contract = contract
         self.by_rates = contract.action == "rates"
         self._ages_ns = ages_ns

@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from mavbridge.flight.state import motion_since
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
-from policy.data.flight_data import FlightData
+from policy.data.flight_data import DatasetError, FlightData
 from policy.data.samples import (
     BLIND_SHARE,
     FORCE_NOISE_MPS2,
@@ -85,6 +85,20 @@ def test_a_chunk_beyond_the_end_holds_its_last_known_stick() -> None:
     chunk, known = line.chunks(np.array([190]))
     assert known.tolist() == [[True, True, False, False]]
     np.testing.assert_array_equal(chunk[0, 2:], chunk[0, [1, 1]])
+
+
+def test_a_chunk_needs_five_actions_a_second() -> None:
+    """Rounded stamps of 5 Hz are at times more than 200 ms apart."""
+
+    def slow(gap_ms: int) -> FlightData:
+        at_ns = 10**9 + np.arange(0, 4000, gap_ms) * MS
+        at_ns[1::2] += MS // 20
+        return flown(400, target_ns=at_ns, target=np.zeros((len(at_ns), 4), np.float32))
+
+    line = timeline(slow(200))
+    assert line.chunks(np.arange(30, 300))[1].all()
+    with pytest.raises(DatasetError, match="actions are 250 ms apart"):
+        timeline(slow(250))
 
 
 def test_the_runtime_gives_the_same_motion_since_exposure() -> None:
