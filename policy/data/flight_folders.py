@@ -9,7 +9,6 @@ from pathlib import Path
 import av
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
@@ -315,8 +314,11 @@ def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
 
     A tick without a solve counts as no later than the decisions after it.
     """
-    started = pc.subtract(ticks["chunk_computed_ns"], ticks["predict_ns"])
-    at_ns = pc.coalesce(started, pa.array(stamps(name, ticks, "woke_ns"))).to_numpy()
+    at_ns = stamps(name, ticks, "woke_ns")
+    inputs = ("chunk_computed_ns", "predict_ns")
+    solved = np.logical_and(*(np.asarray(ticks[column].is_valid()) for column in inputs))
+    rows = ticks.filter(pa.array(solved))
+    at_ns[solved] = np.subtract(*(stamps(name, rows, column) for column in inputs))
     return np.minimum.accumulate(at_ns[::-1])[::-1]
 
 

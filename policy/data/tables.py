@@ -32,7 +32,7 @@ def number_column(name: str, table: pa.Table, column: str) -> np.ndarray:
     if values.null_count:
         raise DatasetError(f"{name}: {column} is missing in {values.null_count} rows")
     array = np.asarray(values.to_numpy())
-    if array.ndim != 1 or array.dtype.kind not in "if":
+    if array.size and (array.ndim != 1 or array.dtype.kind not in "if"):
         raise DatasetError(f"{name}: {column} must hold a number a row")
     return array
 

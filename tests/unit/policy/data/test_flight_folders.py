@@ -224,17 +224,22 @@ def test_a_flight_that_nothing_can_be_learned_from_is_refused(
     ("table", "column"),
     [
         *(("ticks", name) for name in ("attitude_ns", "velocity_ns", "feature_captured_ns")),
+        *(("ticks", name) for name in ("chunk_computed_ns", "predict_ns")),
         ("frames", "gate_yaw_rad"),
     ],
 )
-def test_a_column_of_another_type_is_named(tmp_path: Path, table: str, column: str) -> None:
-    path = flight(tmp_path / "a") / f"{table}.parquet"
+def test_a_column_of_another_type_is_named_unless_it_is_empty(
+    tmp_path: Path, table: str, column: str
+) -> None:
+    path = flight(tmp_path / "a", solved_ns=[(5 * MS, MS)] * 3) / f"{table}.parquet"
     rows = pq.read_table(path)
     if column in rows.column_names:
         rows = rows.drop_columns([column])
     pq.write_table(rows.append_column(column, pa.array(["x"] * rows.num_rows)), path)
     with pytest.raises(DatasetError, match=f"{column} must hold a number a row"):
         read_flight(path.parent)
+    pq.write_table(rows.append_column(column, pa.nulls(rows.num_rows)), path)
+    assert len(read_flight(path.parent).captured_ns) == 2
 
 
 def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
