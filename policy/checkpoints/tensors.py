@@ -158,12 +158,17 @@ def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def find_weights(path: Path, loaded: Mapping[Any, Any]) -> dict[str, Tensor]:
     """Return the weights of a torch file: it is a state dict, or holds one under a usual key."""
-    tables = [
-        key
+    counts = {
+        key: sum(
+            each.numel()
+            for each in table.values()
+            if isinstance(each, Tensor) and each.is_floating_point()
+        )
         for key, table in loaded.items()
         if isinstance(table, Mapping)
-        and any(isinstance(each, Tensor) and each.is_floating_point() for each in table.values())
-    ]
+    }
+    # Metrics and statistics are far smaller; averages may leave out a frozen encoder.
+    tables = [key for key, count in counts.items() if count and 20 * count >= max(counts.values())]
     if len(tables) > 1:
         raise CheckpointError(
             f"{path}: holds weights as {' and '.join(map(repr, tables))}: save those that are to "
