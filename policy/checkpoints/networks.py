@@ -118,7 +118,8 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
         state = _read_torch(path)
     policy = load_fitting(
         *(path, partial(build_policy, config), state),
-        "Name the size and encoder of its training, as in --policy toge:medium:resnet18",
+        "Name the size and encoder of its training, as in --policy toge:medium:resnet18, or save "
+        "the network's own state_dict()",
     )
     if vector:
         _require_reproduced(path, policy, vector)

@@ -106,19 +106,26 @@ def _require_fit(
     path: Path, wanted: Mapping[str, Tensor], state: Mapping[str, Tensor], advice: str
 ) -> None:
     """Raise CheckpointError with the first misfits and the next step; torch would list hundreds."""
-    missing = [name for name in wanted if name not in state]
-    problems = [f"missing {name!r}" for name in missing if not name.endswith(_COUNT)]
-    problems += [f"unexpected {name!r}" for name in state if name not in wanted]
+    missing = [name for name in wanted if name not in state and not name.endswith(_COUNT)]
+    unexpected = [name for name in state if name not in wanted]
+    misfits = []
     for name, value in state.items():
-        if name in wanted and (shape := list(wanted[name].shape)) != list(value.shape):
-            problems.append(f"{name!r} is {list(value.shape)}, must be {shape}")
+        if name not in wanted:
+            continue
+        if (shape := list(wanted[name].shape)) != list(value.shape):
+            misfits.append(f"{name!r} is {list(value.shape)}, must be {shape}")
         is_plain = value.layout == torch.strided and not value.is_meta
         if not is_plain or (value.dtype not in _REAL and not name.endswith(_COUNT)):
-            problems.append(f"{name!r} is no dense tensor of real numbers, but {value.dtype}")
-    if problems:
+            misfits.append(f"{name!r} is no dense tensor of real numbers, but {value.dtype}")
+    if count := len(missing) + len(unexpected) + len(misfits):
+        shown = [f"missing {name!r}" for name in missing[:2]]
+        shown += [f"unexpected {name!r}" for name in unexpected[:2]]
+        if wrapped := [name for name in unexpected if missing and name.endswith(f".{missing[0]}")]:
+            prefix = wrapped[0].removesuffix(missing[0])
+            advice = f"Its names begin with {prefix!r}: save the network's own state_dict()"
         raise CheckpointError(
-            f"{path}: does not fit this policy in {len(problems)} places: "
-            f"{'; '.join(problems[:4])}. {advice}"
+            f"{path}: does not fit this policy in {count} places: "
+            f"{'; '.join([*shown, *misfits][:4])}. {advice}"
         )
 
 

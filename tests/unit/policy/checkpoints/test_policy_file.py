@@ -221,7 +221,11 @@ def test_state_dicts_load_bare_and_as_training_loops_save_them(small_toge, tmp_p
             lambda s: {name: value for name, value in s.items() if name != NAME},
             r"missing 'fusion\.mlp\.0\.weight'",
         ),
-        (lambda s: {**s, "surprise": torch.zeros(3)}, "unexpected 'surprise'"),
+        (lambda s: {**s, "n_averaged": torch.tensor(3)}, "1 places: unexpected 'n_averaged'.* own"),
+        (
+            lambda s: {"state_dict": behind("model.", s), "callbacks": {}},
+            r"missing 'backbone\.conv1.*; unexpected 'model\.backbone.* begin with 'model\.': save",
+        ),
         (lambda s: {**s, "vast": torch.zeros(1).expand(1 << 40)}, "unexpected 'vast'"),
         (lambda s: {**s, NAME: s[NAME].to_sparse()}, f"'{NAME}' is no dense tensor of real"),
         (lambda s: {**s, NAME: s[NAME].to("meta")}, f"'{NAME}' is no dense tensor of real"),
