@@ -34,6 +34,8 @@ Net = TypeVar("Net", bound=nn.Module)
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
     """Write a ``.safetensors`` file; replaces ``path`` atomically."""
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     try:
         with whole_file(path) as draft:
             save_file(dict(tensors), draft, metadata=dict(header))
