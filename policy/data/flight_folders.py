@@ -268,8 +268,14 @@ def _read_meta(folder: Path) -> dict[str, object]:
 
 def _contract(name: str, meta: Mapping[str, object]) -> Contract:
     """Return the contract that a flight was flown by."""
+    contract = meta.get("contract")
+    if isinstance(contract, dict) and "state_frame" not in contract:
+        raise DatasetError(
+            f"{name}: its contract names no state_frame: write 'ned_frd' or 'enu_flu' there, the "
+            "axes of its states"
+        )
     try:
-        return Contract.from_json(json.dumps(meta.get("contract")))
+        return Contract.from_json(json.dumps(contract))
     except ContractError as error:
         raise DatasetError(f"{name}: {error}") from error
 

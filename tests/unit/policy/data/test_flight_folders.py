@@ -198,6 +198,7 @@ def contract(**terms: object) -> dict[str, object]:
         ({"format": "other"}, {}, "not a flight of mavbridge"),
         ({"version": 2}, {}, "version 2"),
         ({"contract": None}, {}, "a: the contract is not a JSON object"),
+        ({"contract": {}}, {}, "a: its contract names no state_frame: write"),
         ({"contract": {"state_frame": "body"}}, {}, "state_frame must be 'ned_frd' or 'enu_flu'"),
         ({}, {"expert": [STICK, (0, math.nan, 0, 0), STICK]}, "expert holds NaN .* in row 1"),
         ({}, {"state": [(900.0, *LEVEL[1:])] * 3}, "vx_mps reaches 900"),
