@@ -199,6 +199,8 @@ class _Flight:
         end: FlightEnd = "fault" if asked.is_fault else asked.end
         if summary is not None and summary.outcome.end is not None:
             end = summary.outcome.end
+        elif self._observers.referee.is_taken:  # the guard died after the flight
+            end = "takeover"
         return self._observers.referee.outcome(end, self._bridge.view.status, asked.reason)
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:

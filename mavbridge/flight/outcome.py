@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, CourseProgress
 from mavbridge.core.errors import ExitCode
-from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
@@ -90,7 +90,7 @@ class FlightReferee:
         was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING.value
         if self._is_flying:
             self._began_ns = self._began_ns or event.sent_ns
-            self._flown = event
+            self._flown, self._reason = event, None
             self._has_position = self._has_position or event.position_ned_m is not None
         elif was_flying:
             self._reason = event.release_reason
@@ -102,6 +102,11 @@ class FlightReferee:
     def has_flown(self) -> bool:
         """True if the policy has had control."""
         return self._flown is not None
+
+    @property
+    def is_taken(self) -> bool:
+        """True if the pilot has ended the policy's last flight."""
+        return self._reason is not None and self._reason.kind is Kind.PILOT
 
     @property
     def crash(self) -> str | None:

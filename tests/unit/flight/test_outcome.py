@@ -191,6 +191,19 @@ def test_a_fault_names_its_reason_and_is_no_example() -> None:
     )
 
 
+def test_a_second_flight_has_a_reason_of_its_own() -> None:
+    taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
+    first = [*course_ticks(50), make_released_tick(51, taken, phase="released")]
+    referee = FlightReferee(None)
+    for ticks, is_taken in ((first, True), (course_ticks(50), False)):
+        for tick in ticks:
+            referee.emit(tick)
+        assert referee.is_taken is is_taken
+    outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED))
+    assert outcome is not None
+    assert outcome.reason == because(Code.GUARD_DIED)
+
+
 def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:
     hit = make_tick(90, phase="flying", texts=("vehicle: Crash: hit gate 1 at 9.9 m/s",))
     outcome = judged([*course_ticks(90), hit], "course")
