@@ -361,7 +361,7 @@ class _Flight:
             screen.show_message(text)
         if view.status.armed and not view.status.is_landed and view.flights:
             height = "" if view.height_m is None else f" at {view.height_m:.0f} m"
-            left = f"still armed in {view.status.mode}{height}"
+            left = f"still armed in {view.status.mode or 'an unknown mode'}{height}"
             if summary is not None:
                 screen.show_message(f"control given back, {left}")
             elif view.phase is Phase.HOLDING and not self._guard.wait(0):
@@ -374,6 +374,7 @@ class _Flight:
                 f"{summary.dropped_messages} messages of the guard were dropped: this process was "
                 "too busy to read them"
             )
-        is_found = view.status.mode is not None
+        # After a reboot in flight the mode is unknown until the next heartbeat.
+        is_found = view.status.mode is not None or view.flights > 0
         autopilot = view.status.autopilot if is_found else None
         self._observers.finish(self._guard.summary, autopilot, self._outcome)

@@ -202,7 +202,7 @@ class FlightObservers:
     ) -> None:
         """Show the report and write it to --report; without a vehicle, delete the recording."""
         try:
-            if autopilot is not None:
+            if autopilot is not None or outcome is not None:
                 self._report(summary, autopilot, outcome)
             elif self._recorder is not None and self._config.record is not None:
                 remove_flight(self._config.record, self._plan.contract.cameras)
@@ -210,7 +210,7 @@ class FlightObservers:
             self.screen.close(SCREEN_CLOSE_S)
 
     def _report(
-        self, summary: GuardSummary | None, autopilot: str, outcome: FlightOutcome | None
+        self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None
     ) -> None:
         viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(

@@ -176,7 +176,7 @@ def describe(outcome: FlightOutcome) -> str:
     if outcome.speed_mps is not None:
         left.append(f"{outcome.speed_mps:.1f} m/s")
     state = "landed" if outcome.is_landed else "armed" if outcome.is_armed else "disarmed"
-    left.append(f"now {state} in {outcome.mode}")
+    left.append(f"now {state} in {outcome.mode or 'an unknown mode'}")
     text = "; ".join(", ".join(part) for part in (course, left) if part)
     is_told = outcome.end in _UNPLANNED and outcome.reason is not None
     return f"{text}: {outcome.reason}" if is_told else text

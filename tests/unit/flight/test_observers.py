@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from helpers.factories import make_tick
 from helpers.fakes import FakeClock
 from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.plan import plan_flight
+from mavbridge.guard.wire import GuardStatus
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 
@@ -36,6 +38,14 @@ def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     observers(tmp_path, said).finish(None, "ardupilot", None)
     assert f"--report {tmp_path}: Is a directory" in said.getvalue()
     assert " of 10 Hz" in said.getvalue(), "the rate of the contract's camera"
+
+
+def test_a_flight_that_flew_is_reported_although_the_vehicle_is_gone(tmp_path: Path) -> None:
+    watching = observers(report := tmp_path / "report.json", io.StringIO())
+    watching.referee.emit(make_tick(0, phase="flying"))
+    gone = GuardStatus("ArduPilot", None, False, None, (), None)
+    watching.finish(None, None, watching.referee.outcome("fault", gone))
+    assert report.exists()
 
 
 def test_the_terminal_is_given_back_even_if_the_report_fails(

@@ -202,6 +202,7 @@ def test_a_second_flight_has_a_reason_of_its_own() -> None:
     outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED))
     assert outcome is not None
     assert outcome.reason == because(Code.GUARD_DIED)
+    assert "now armed in an unknown mode: " in describe(replace(outcome, mode=None))  # rebooted
 
 
 def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:
