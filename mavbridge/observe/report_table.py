@@ -80,11 +80,12 @@ def _link_verdict(link: LinkStats) -> str:
     lost = (
         "loss not measured"
         if link.lost_fraction is None
-        else f"{link.lost_fraction:.2%} of the vehicle's messages lost"
+        else f"{shown_share(link.lost_fraction, 2)} of the vehicle's messages lost"
     )
     sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
     limits = "".join(
-        f", {stick} beyond what the vehicle does in {share:.1%}" for stick, share in link.saturated
+        f", {stick} beyond what the vehicle does in {shown_share(share, 1)}"
+        for stick, share in link.saturated
     )
     return f"{sent}, {echo[link.echo_confirmed]}, {lost}{limits}"
 
@@ -109,6 +110,13 @@ def _counted(count: int, noun: str) -> str:
 def shown_rate(rate_hz: float | None) -> str:
     """Format a rate with one decimal; a dash for None."""
     return _NOT_MEASURED if rate_hz is None else f"{rate_hz:.1f}"
+
+
+def shown_share(share: float, digits: int) -> str:
+    """Format a fraction as per cent; a small one, which would read as zero, by its bound."""
+    least = 10.0 ** -(2 + digits)
+    bound = f"under {least:.{digits}%}"
+    return bound if 0 < share < least / 2 else f"{share:.{digits}%}"
 
 
 def rate_style(rate_hz: float | None, target_hz: float) -> str:

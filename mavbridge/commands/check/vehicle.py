@@ -32,6 +32,7 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import Transport
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
+from mavbridge.observe.report_table import shown_share
 from policy.contract import Contract
 
 SET_UP_S = 15.0
@@ -221,7 +222,8 @@ def _link_rows(
     for group in terms.streams:
         if group.is_needed and not terms.is_deaf:
             yield _rate_row(group, rates_hz, terms.plan)
-    lost = stats.lost_fraction or 0.0
+    lost, uncounted = stats.lost_fraction, "no message came to count losses by"
+    shown = "not measured" if lost is None else f"{shown_share(lost, 1)} of its messages"
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""
     advice = (
         "messages of the vehicle get lost: look at cable, baud rate and radio, and at other "
@@ -229,18 +231,19 @@ def _link_rows(
     )
     yield _link_row(
         "loss",
-        f"{lost:.1%} of its messages{bad}",
+        shown + bad,
         f"under {_LOSSY:.0%}",
-        warn=advice if lost > _LOSSY else "",
-        no_go=advice if lost > _TOO_LOSSY else "",
+        warn=uncounted if lost is None else advice if lost > _LOSSY else "",
+        no_go=advice if lost is not None and lost > _TOO_LOSSY else "",
     )
     trip, error_ms = stats.rtt_ms, stats.timesync_error_ms
-    is_slow = trip is None or trip.p50 > _SLOW_MS
+    slow = "half of it is added to the age of every stick"
+    unknown = "the vehicle answers no TIMESYNC: the link's delay is not known"
     yield _link_row(
         "round trip",
         "no answer" if trip is None else f"{trip.p50:.1f} ms, at most {trip.max:.1f}",
         f"under {_SLOW_MS:.0f} ms",
-        warn="half of it is added to the age of every stick" if is_slow else "",
+        warn=unknown if trip is None else slow if trip.p50 > _SLOW_MS else "",
     )
     advice = stats.slow_clock or (
         "the vehicle's stamps cannot be trusted: ages count from arrival, which hides delay"
