@@ -42,8 +42,8 @@ class RerunRecording:
             MavbridgeError: as in ``prepare_target``.
         """
         prepared = prepare_target(target)
-        is_file = isinstance(prepared, Path)
-        self._sink = rr.FileSink(prepared) if is_file else rr.GrpcSink(str(prepared))
+        self._file = prepared if isinstance(prepared, Path) else None
+        self._sink = rr.FileSink(self._file) if self._file else rr.GrpcSink(str(prepared))
         rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
         self.stream = rr.RecordingStream(application, recording_id=uuid4())
 
@@ -52,11 +52,15 @@ class RerunRecording:
         self.stream.set_sinks(self._sink, default_blueprint=blueprint)
 
     def close(self) -> None:
-        """Deliver the rest and close; raise MavbridgeError if the viewer is gone."""
+        """Deliver the rest and close; raise MavbridgeError if the viewer is gone, or the disk is
+        full."""
         try:
             self.stream.flush()
             self.stream.disconnect()
         except RuntimeError as error:
+            if self._file is not None:
+                told = f"{self._file} is not complete ({error}): make room on its disk"
+                raise MavbridgeError(told) from error
             raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
 
 

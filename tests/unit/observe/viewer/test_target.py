@@ -2,13 +2,19 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.observe.viewer import target
-from mavbridge.observe.viewer.target import check_target, prepare_target, spawn_viewer
+from mavbridge.observe.viewer.target import (
+    RerunRecording,
+    check_target,
+    prepare_target,
+    spawn_viewer,
+)
 
 LISTENS_UNTIL_KILLED = """
 import socket, sys
@@ -24,6 +30,14 @@ def bound_port() -> Iterator[int]:
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
         yield bound.getsockname()[1]
+
+
+def test_a_file_that_was_cut_short_is_named(tmp_path: Path) -> None:
+    recording = RerunRecording("flight", str(tmp_path / "full.rrd"))
+    recording.stream = Mock()
+    recording.stream.flush.side_effect = RuntimeError("File-writer thread shut down")
+    with pytest.raises(MavbridgeError, match=r"full\.rrd is not complete .*: make room"):
+        recording.close()
 
 
 def test_a_file_is_tried_and_not_left_behind(tmp_path: Path) -> None:
