@@ -29,7 +29,8 @@ class SingleRatePolicy(Protocol):
     a lock.
 
     Without a chunk for the current state, ``predict`` or ``predict_fast`` raises
-    ``policy.errors.NoChunkError``; any other exception ends the flight.
+    ``policy.errors.NoChunkError``, and so does ``encode_visual`` to skip an image; any other
+    exception ends the flight.
     """
 
     contract: Contract

@@ -9,6 +9,7 @@ from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import CameraImage, FeatureFrame, FloatArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
+from policy.errors import NoChunkError
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
 """Longest wait for a frame between two checks of the stop flag."""
@@ -80,8 +81,10 @@ class VisionLoop:
             self.alive_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """Wait up to ``READ_TIMEOUT_NS`` for one frame; encode and publish it. Raise CameraError as
-        ``run``."""
+        """Wait up to ``READ_TIMEOUT_NS`` for one frame; encode and publish it.
+
+        An image for which the policy raises NoChunkError is skipped. Raise CameraError as ``run``.
+        """
         frame = self._camera.read(READ_TIMEOUT_NS)
         started_ns = self._clock.now_ns()
         if frame is None:
@@ -99,8 +102,12 @@ class VisionLoop:
             fault = because(Code.IMAGE_AHEAD, ahead_ms=ahead_ms, limit_ms=limit_ms)
         with self._encoder_lock:
             self.encoding_since_ns = self._clock.now_ns()
-            value = self._encode(frame.rgb, self._number)
-            self.encoding_since_ns = None
+            try:
+                value = self._encode(frame.rgb, self._number)
+            except NoChunkError:
+                return  # the last feature ages, up to its limit
+            finally:
+                self.encoding_since_ns = None
         value.setflags(write=False)
         ready_ns = self._clock.now_ns()
         feature = FeatureFrame(

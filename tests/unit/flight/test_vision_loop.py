@@ -13,6 +13,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.vision_loop import VisionLoop
+from policy.errors import NoChunkError
 
 FRAME_NS = NS_PER_S // 30
 
@@ -83,6 +84,20 @@ def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(is_watched):
     code = Code.IMAGE_FROZEN if is_watched else None
     assert set(seen) == {(False, None), (True, code)}
     assert len(sink.visions) == 4 * NS_PER_S // FRAME_NS + 1
+
+
+def test_an_image_that_the_policy_skips_leaves_the_last_feature():
+    clock, cache = FakeClock(), FeatureCache()
+
+    def encode(rgb, camera):
+        if clock.now_ns() > START_NS + 2 * FRAME_NS:
+            raise NoChunkError("too dark")
+        return np.zeros((1, 8), np.float32)
+
+    loop = make_loop(clock, StillCamera(clock, SCENE), cache=cache, encode=encode)
+    for _ in range(4):
+        loop.step()
+    assert (cache.latest().frame_id, loop.encoding_since_ns) == (2, None)
 
 
 def test_a_camera_faster_than_the_visual_rate_is_thinned():
