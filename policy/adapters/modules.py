@@ -37,39 +37,38 @@ def adopt_modules(
 ) -> SingleRatePolicy | None:
     """Return the policy made of the modules or methods of ``holder``, or None if it has none.
 
-    A contract without feature_dim gets it from the encoder's output. Of the description's inputs
-    only the state's name is used, for a forward that takes no image.
+    A contract without feature_dim gets it from the encoder's output.
     """
     encoder, head, denoiser = (
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
     )
-    interface, picks, modules = description.interface, description.outputs, modules_of(holder)
+    interface, modules = description.interface, modules_of(holder)
     if encoder is None and head is None and denoiser is None:
         if not _has_forward(holder):
             return None
-        call = _Call(name, holder, "chunk", picks, ("image", "state", "action_history"))
-        call.skip = int(_takes_no_image(call, interface, description.inputs.get("state")))
+        call = _Call(name, holder, "chunk", description, ("image", "state", "action_history"))
+        call.skip = int(_takes_no_image(call, interface))
         call.require_order()
         return _owned(ForwardPolicy(interface, call), holder, modules)
     if encoder is None or (head is None) == (denoiser is None):
         raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
     for module in modules:
         module.eval()
-    features = _Call(name, encoder, "feature", picks, ("image",))
+    features = _Call(name, encoder, "feature", description, ("image",))
 
     def encode(image: Tensor) -> Tensor:
         return features(image).flatten(1)
 
     interface = _with_feature(name, encode, interface)
     if head is not None:
-        call = _Call(name, head, "chunk", picks, ("feature", "state", "action_history"))
+        call = _Call(name, head, "chunk", description, ("feature", "state", "action_history"))
         call.require_order()
         return _owned(HeadPolicy(interface, encode, call), holder, modules)
     schedule = getattr(holder, "noise_schedule", None) or NoiseSchedule()
     if description.schedule:
         schedule = make_schedule(name, description.schedule)
     roles = ("noisy", "timestep", "feature", "state", "action_history")
-    call = _Call(name, denoiser, "prediction", picks, roles)
+    call = _Call(name, denoiser, "prediction", description, roles)
     call.require_order()
     return _owned(DenoiserPolicy(interface, encode, call, schedule, seed), holder, modules)
 
@@ -215,13 +214,13 @@ def _is_script(method: object) -> bool:
     return getattr(method, "schema", None) is not None
 
 
-def _takes_no_image(call: "_Call", interface: Interface, state_name: str | None) -> bool:
+def _takes_no_image(call: "_Call", interface: Interface) -> bool:
     """True if the first argument of a forward is the state.
 
     Decided by the argument's name; a single argument without a telling name is tried.
     """
     first = next(iter(call.names), "")
-    if first in (state_name, *USUAL_NAMES["state"]):
+    if first in USUAL_NAMES["state"]:
         return True
     if len(call.names) != 1 or first in (*USUAL_NAMES["image"], *interface.camera_keys):
         return False
@@ -252,17 +251,18 @@ class _Call:
         name: str,
         function: Any,
         result: str,
-        outputs: Mapping[str, str | int],
+        description: Description,
         roles: Sequence[str],
     ) -> None:
         """Prepare the calls, with arguments of these roles.
 
-        ``outputs[result]`` selects the result among several values. An argument with a number or
+        ``outputs[result]`` of the description selects the result among several values, and its
+        ``inputs`` name arguments. An argument with a number or
         text as its default is a setting and keeps it, with all after it, unless it is named as a
         role.
         """
         self._name, self._function, self._roles = name, function, roles
-        self._result, self._pick = result, outputs.get(result)
+        self._result, self._pick = result, description.outputs.get(result)
         self.skip = 0
         """Leading arguments to drop: 1 for a policy that takes no image."""
         called = function.forward if isinstance(function, nn.Module) else function
@@ -279,7 +279,8 @@ class _Call:
         given = takewhile(
             lambda each: each[0] in usual or not isinstance(each[1], int | float | str), declared
         )
-        self.names = [name for name, _ in given]
+        told = {name: role for role, name in description.inputs.items()}
+        self.names = [told.get(name, name) for name, _ in given]
         takes_all = takes_any and len(self.names) == len(declared)
         self._count = sys.maxsize if takes_all else len(self.names)
 

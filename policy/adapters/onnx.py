@@ -96,7 +96,10 @@ class GraphFile:
             for port in model.inputs
         ]
         if len(set(roles)) < len(roles):
-            raise CheckpointError(f"{path}: two inputs have one role: {roles}")
+            raise CheckpointError(
+                f"{path}: two inputs have one role: {roles}. Export one input for each; several "
+                "cameras are one image [1, cameras, channels, height, width]"
+            )
         self.roles = roles
         """Role of each input, in the graph's order; the role of a hidden input is its name."""
         self.takes_bytes = self._require_types(model, roles, pairs)

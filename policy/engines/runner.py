@@ -130,7 +130,8 @@ def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) ->
 
 def to_numpy(array: Any) -> FloatArray:
     """Return a float32 copy of an array of any library, on any device."""
-    return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
+    # numpy has no bfloat16.
+    return np.array(array.cpu().float().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
 def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:

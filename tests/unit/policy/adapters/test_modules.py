@@ -142,6 +142,17 @@ def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(act(runner)[0, 0] + 0.5, abs=1e-3)
 
 
+class ImageAsObs(nn.Module):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return (torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)
+
+
+def test_an_argument_is_what_the_description_calls_it(tmp_path: Path) -> None:
+    path = archive(tmp_path, ImageAsObs(), described(inputs={"image": "obs"}))
+    runner = load(f"torchscript:{path}", engine="torch", dual_rate=False).runner
+    assert act(runner, level=255)[0, 0] > act(runner, level=0)[0, 0]
+
+
 class StateFirst(nn.Module):
     def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         return torch.zeros(1, 8, 4) + state.mean() + image.mean()
