@@ -165,7 +165,7 @@ class TorchRemembers:
 
     def predict(self, image, state, action_history, num_diffusion_steps):
         self.memory = state[:, :1] + (0 if self.memory is None else self.memory) + 0.25
-        return self.memory[:, None].repeat(1, 16, 4)
+        return self.memory[:, None].repeat(1, 16, 4).bfloat16()
 
     def reset(self):
         self.memory.zero_()
