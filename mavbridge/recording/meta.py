@@ -118,8 +118,10 @@ def read_meta(folder: Path) -> FlightMeta:
         if odd := [each.name for each in folder.iterdir() if not (each.is_file() or each.is_dir())]:
             raise FlightError(f"{folder / odd[0]} is neither a file nor a folder: leave it out")
         document: Any = read_json(folder / META)
-    except OSError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise FlightError(_unreadable(folder)) from error
+    except OSError as error:
+        raise FlightError(f"{error.filename} cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise FlightError(f"{folder / META} is not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
@@ -140,9 +142,8 @@ def _unreadable(folder: Path) -> str:
     inside = sorted(entry.name for entry in folder.iterdir())
     if not inside:
         return f"{folder} is empty: nothing was recorded there"
-    flights = [name for name in inside if (folder / name / META).is_file()]
-    if flights:
-        return f"{folder} holds flights, and is none: name one of them ({folder / flights[0]})"
+    if flights := sorted(folder.glob(f"*/{META}")):
+        return f"{folder} holds flights, and is none: name one of them ({flights[0].parent})"
     return (
         f"{folder} is no recorded flight: it has no {META} (it has {', '.join(inside[:3])}); "
         "mavbridge --record makes one"

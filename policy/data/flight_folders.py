@@ -41,15 +41,18 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
     flights."""
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir():
-            raise DatasetError(f"{path}: no such folder")
-        inside = sorted(meta.parent for meta in path.glob("*/meta.json"))
-        flights = [path] if (path / "meta.json").is_file() else inside
-        if not flights:
-            raise DatasetError(
-                f"{path}: neither a flight (it has no meta.json) nor a folder of flights; it "
-                f"holds {sorted(entry.name for entry in path.iterdir())[:6]}"
-            )
+        try:
+            if not path.is_dir():
+                raise DatasetError(f"{path}: no such folder")
+            inside = sorted(meta.parent for meta in path.glob("*/meta.json"))
+            flights = [path] if (path / "meta.json").is_file() else inside
+            if not flights:
+                raise DatasetError(
+                    f"{path}: neither a flight (it has no meta.json) nor a folder of flights; it "
+                    f"holds {sorted(entry.name for entry in path.iterdir())[:6]}"
+                )
+        except OSError as error:
+            raise DatasetError(f"{error.filename} cannot be read: {error.strerror}") from error
         found += flights
     return list(dict.fromkeys(flight.resolve() for flight in found))
 

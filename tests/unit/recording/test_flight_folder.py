@@ -149,7 +149,9 @@ def test_a_spoiled_flight_says_what_is_wrong(flight: Path, spoil: Spoil, told: s
 def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
     folder = flight.parent
     (folder / "empty").mkdir()
+    (folder / "odd/meta.json").mkdir(parents=True)
     for path, told in (
+        (folder / "odd", "odd/meta.json cannot be read: it is a folder"),
         (folder / "nowhere", "there is no folder"),
         (flight / "meta.json", "is a file: a recorded flight is a folder"),
         (folder / "empty", "is empty: nothing was recorded there"),

@@ -172,6 +172,8 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
 
 
 def test_no_flights_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="x cannot be read: File name too long"):
+        find_flights([tmp_path / ("x" * 300)])
     with pytest.raises(DatasetError, match="no such folder"):
         find_flights([tmp_path / "missing"])
     with pytest.raises(DatasetError, match="neither a flight"):
