@@ -74,7 +74,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
             vehicle=make_vehicle(autopilot=config.autopilot, conditions=variation.conditions),
         )
         pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
-        meta = _meta(spec, variation, pilot.runner)
+        meta = _meta(spec, variation, pilot.runner, flight.clock.now_ns())
         writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
         stack.callback(writer.close)
         result = flight.fly(
@@ -118,10 +118,12 @@ def _terms(
     return contract, replace(student, contract=contract)
 
 
-def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -> FlightMeta:
+def _meta(
+    spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner, start_ns: int
+) -> FlightMeta:
     return FlightMeta(
         started_at=datetime.now(UTC).isoformat(),
-        start_ns=0,
+        start_ns=start_ns,
         mavbridge_version=mavbridge.__version__,
         source="dagger" if spec.config.policy.checkpoint else "demonstration",
         policy=runner.name,

@@ -14,6 +14,7 @@ from mavbridge.commands.demonstrate.run import DemonstrationSpec, demonstrate, f
 from mavbridge.commands.train import fit_to_flights
 from mavbridge.config.episodes import COURSE_SEEDS, AutopilotKind, DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
@@ -55,6 +56,7 @@ def test_a_demonstration_finishes_its_course_and_says_what_it_was(flight: Record
     assert meta.finished
     assert meta.success
     assert meta.source == "demonstration"
+    assert 0 <= flight.ticks["woke_ns"][0].as_py() - meta.start_ns < 60 * NS_PER_S
     assert meta.course_seed == 30_000
     assert (meta.image_height, meta.image_width) == (SIZE, SIZE)
     assert meta.frames_dropped == meta.ticks_dropped == 0
