@@ -43,7 +43,7 @@ MAX_MISSING_FRAMES = 1
 """Longest run of missing frames. After a longer one a new episode begins, because LeRobot assumes
 rows at equal intervals."""
 MAX_RATE_OFF = 0.2
-"""Largest relative difference between the rate of a flight and the common rate."""
+"""Largest relative difference between a flight's and the common rate, or that and an integer."""
 
 
 @dataclass(frozen=True)
@@ -115,17 +115,23 @@ def common_fps(parts: Sequence[Stretch]) -> int:
     """Return the integer frame rate that LeRobot assumes for all frames.
 
     Raises:
-        UserError: flights of several rates.
+        UserError: flights of several rates, or of one that is far from any integer.
     """
-    fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
+    common = _rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))
+    fps = max(1, round(common))
+    if abs(common / fps - 1.0) > MAX_RATE_OFF:
+        raise UserError(
+            f"these flights have {common:.3g} frames a second, and a LeRobot dataset must have a "
+            f"whole number: record at {fps} images a second, or use --format mcap"
+        )
     # Per flight, because a stretch of a few frames has no rate of its own.
     for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
         whole = list(of_flight)
         own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
-        if abs(own / fps - 1.0) > MAX_RATE_OFF:
+        if abs(own / common - 1.0) > MAX_RATE_OFF:
             raise UserError(
-                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
-                "LeRobot dataset has one rate, so export them apart"
+                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest "
+                f"{common:.3g}: a LeRobot dataset has one rate, so export them apart"
             )
     return fps
 
