@@ -125,7 +125,7 @@ def leave_out_failed(
 
 
 def read_flight(folder: Path) -> FlightData:
-    """Read one flight folder, complete or left by a crash.
+    """Read one flight folder, complete or left by a crash, with the images of its first camera.
 
     The sticks to imitate are the ``expert`` column if there is one; otherwise the pilot's after
     taking over from the policy; otherwise those that the policy flew; in a flight that sent nothing
@@ -136,7 +136,10 @@ def read_flight(folder: Path) -> FlightData:
     contract = _contract(name, meta)
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
-    damage: list[str] = []
+    damage = [
+        f"{folder}: camera {other} is left out, only the first is read"
+        for other in contract.cameras[1:]
+    ]
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     frames, numbers = _read_table(folder, "frames", _FRAME_COLUMNS, damage)
     video = folder / VIDEO

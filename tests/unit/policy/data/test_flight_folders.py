@@ -61,6 +61,13 @@ def test_expert_is_imitated_where_there_is_one(tmp_path: Path) -> None:
         read_ages(flight(tmp_path / "b"))
 
 
+def test_cameras_that_are_not_read_are_named(tmp_path: Path) -> None:
+    folder = flight(tmp_path / "a", contract(cameras=["front", "down"]))
+    assert read_flight(folder).damage == (
+        f"{folder}: camera down is left out, only the first is read",
+    )
+
+
 def test_a_tick_counts_as_the_decision_behind_it_and_as_no_later_than_the_next(
     tmp_path: Path,
 ) -> None:
