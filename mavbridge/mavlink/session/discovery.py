@@ -58,6 +58,8 @@ class VehicleDiscovery:
     def __init__(self, *, target_system: int) -> None:
         self._target_system = target_system
         self._heard_ns: dict[VehicleIdentity, int] = {}
+        self._replaced: set[VehicleIdentity] = set()
+        """Vehicles at whose address another type was heard since."""
         self._others: set[str] = set()
         self._odd_components: set[int] = set()
         """Components other than 1 that claim to be an autopilot."""
@@ -87,10 +89,11 @@ class VehicleDiscovery:
             vehicle_type=heartbeat.vehicle_type,
             autopilot=heartbeat.autopilot,
         )
-        if vehicle not in self._heard_ns:  # a new type at an old address replaces the old type
-            for other in self._heard_ns:
-                if (other.source, other.address) == (source, address):
-                    self._heard_ns[other] = now_ns - MOVED_NS
+        if vehicle not in self._heard_ns:
+            place = source, address
+            old = {other for other in self._heard_ns if (other.source, other.address) == place}
+            self._replaced = (self._replaced | old) & self._heard_ns.keys()
+        self._replaced.discard(vehicle)
         self._heard_ns.pop(vehicle, None)
         if len(self._heard_ns) >= _CAPACITY:
             del self._heard_ns[next(iter(self._heard_ns))]  # heard longest ago
@@ -114,8 +117,8 @@ class VehicleDiscovery:
         """
         if self._first_ns is None or now_ns - self._first_ns < SETTLE_NS:
             return None
-        heard = [each for each, at_ns in self._heard_ns.items() if now_ns - at_ns < MOVED_NS]
-        wanted = [vehicle for vehicle in heard if self._is_wanted(vehicle)]
+        present = [vehicle for vehicle in self._heard_ns if vehicle not in self._replaced]
+        wanted = [vehicle for vehicle in present if self._is_wanted(vehicle)]
         systems = sorted({vehicle.source.system for vehicle in wanted})
         if len(systems) > 1:
             raise PeerError(

@@ -298,7 +298,7 @@ def test_a_vehicle_that_becomes_a_plane_is_refused_and_has_not_moved() -> None:
     plane = rig.vehicle.end.mav.heartbeat_encode(1, 3, 81, 0, 4)
     rig.vehicle.end.heartbeat = lambda: rig.vehicle.end.pack(plane)  # type: ignore[method-assign]
     with pytest.raises(PeerError, match="FIXED_WING"):
-        rig.run(1.5)
+        rig.run(5.0)
     assert not any("now sends from" in text for text in rig.texts)
 
 
