@@ -96,13 +96,14 @@ def test_the_mode_of_the_way_out(facts: Any, rules: Any, mode: str | None) -> No
     assert mode is not None or stepped.engagement.refusal is None
 
 
+@pytest.mark.parametrize("facts", [PX4, altered(PX4, has_receiver=True, pilot_sticks=CENTRED)])
 @pytest.mark.parametrize(
     ("choice", "mode"), [("auto", "AUTO.LOITER"), ("land", "AUTO.LAND"), ("rtl", "AUTO.RTL")]
 )
 def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest(
-    choice: Any, mode: str
+    facts: Any, choice: Any, mode: str
 ) -> None:
-    stepped = flying(PX4, on_fault=choice)
+    stepped = flying(facts, on_fault=choice)
     moves = [stepped.step(**FAULT)]  # at rest, but neutral has not left yet
     moves += [stepped.step(**FAULT, are_sticks_at_rest=False) for _ in range(40)]
     assert {(move.control, move.mode) for move in moves} == {(NEUTRAL, None)}
