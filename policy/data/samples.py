@@ -132,6 +132,13 @@ class Timeline:
         self.gate = np.concatenate([flight.gate for flight in flights]).reshape(-1, GATE_DIM)
         self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])
         self.frames, self._any_tick = self._usable_frames()
+        if len(self.frames) == 0:
+            low_ms, high_ms = ages_ns[[0, -1]] / 1e6
+            raise DatasetError(
+                f"{flights[0].name}: none of {len(self.captured_ns)} images has a tick with a "
+                f"state and sticks to imitate {low_ms:.0f} to {high_ms:.0f} ms after it: too "
+                "little of it was flown, or camera and ticks are not of one clock"
+            )
 
     def _usable_frames(self) -> tuple[Indices, Indices]:
         """Return the images with an attitude at the exposure and a later tick; a tick for each."""
@@ -147,13 +154,6 @@ class Timeline:
         # The expert knew of gates behind the camera; the image does not show them.
         is_behind = self.gate[:, 0] < 0
         usable = np.flatnonzero(has_tick & has_past & ~is_behind)
-        if len(usable) == 0:
-            low_ms, high_ms = self._ages_ns[[0, -1]] / 1e6
-            raise DatasetError(
-                f"none of {len(self.captured_ns)} images has a tick with a state and sticks to "
-                f"imitate {low_ms:.0f} to {high_ms:.0f} ms after it: are camera and ticks of one "
-                "flight and one clock?"
-            )
         return usable, any_tick
 
     def draw_ticks(self, frames: Indices, random: np.random.Generator) -> Indices:

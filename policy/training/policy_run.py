@@ -69,9 +69,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
         super().__init__(flights, trainee, policy_stages(settings), hooks, folder)
-        self._flights = [flights[index] for index in self.kept]
-        self._batches = self._batches_of(flights, self.kept)
-        self._held = self._batches_of(flights, self.held) if self.held else None
+        self._batches = self._batches_of(self.kept)
+        self._held = self._batches_of(self.held) if self.held else None
         is_measured = any((flight.age_ns > 0).any() for flight in flights)
         if settings.ages is None and not is_measured:
             low_ms, high_ms = USUAL_AGES_MS
@@ -79,10 +78,13 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
                 f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
                 "are assumed (--ages names a flight of a policy on this computer, or a range)"
             )
-        targets = np.concatenate([flight.target for flight in self._flights])
+        targets = np.concatenate([self.flights[index].target for index in self.kept])
         for each in (self.trainee, self.average):
             each.set_sticks(targets)
         self._encoded: FeatureStore | None = None
+
+    def check(self, flight: FlightData) -> None:
+        Timeline([flight], self._network.contract, self._ages_ns)
 
     def learning_rate(self, stage: TrainingStage) -> float:
         if not stage.trains_encoder and self._teacher is None:
@@ -146,15 +148,15 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 
     def export(self) -> None:
         card = self.card(
-            flights=len(self._flights),
-            images=sum(len(flight.captured_ns) for flight in self._flights),
+            flights=len(self.kept),
+            images=sum(self.store.counts[index] for index in self.kept),
             feature_ages_ms=(self._ages_ns[[0, -1]] / NS_PER_MS).tolist(),
         )
         policy = copy.deepcopy(self.average.policy)
         save_checkpoint(self.settings.out, policy, training=card, packed=self.settings.pack)
 
-    def _batches_of(self, flights: Sequence[FlightData], indices: list[int]) -> Batches:
-        chosen = [flights[index] for index in indices]
+    def _batches_of(self, indices: list[int]) -> Batches:
+        chosen = [self.flights[index] for index in indices]
         return Batches(
             Timeline(chosen, self._network.contract, self._ages_ns),
             self.store.only(indices),

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.data.flight_data import FlightData, hold_out
+from policy.data.flight_data import DatasetError, FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.errors import PolicyError
 from policy.training.batches import StepLoss, TensorBatch, ahead
@@ -84,7 +84,7 @@ class TrainingRun(ABC, Generic[M, B]):
         hooks: Hooks,
         folder: Path,
     ) -> None:
-        """Decode all images into ``folder``."""
+        """Leave out the flights that ``check`` refuses, and decode all images into ``folder``."""
         settings = self.settings
         self.trainee, self.stages, self.hooks = trainee, stages, hooks
         self.device = torch.device(settings.device)
@@ -99,12 +99,13 @@ class TrainingRun(ABC, Generic[M, B]):
         self._validations = 0
         self._best: Validation | None = None
         self._is_exported = False
-        self.kept, self.held = hold_out(flights, settings.validation_fraction, settings.seed)
-        """Indices of the flights to learn from, and of those that are held out."""
+        self.flights = self._useful(flights)
+        self.kept, self.held = hold_out(self.flights, settings.validation_fraction, settings.seed)
+        """Indices in ``flights`` of the flights to learn from, and of those that are held out."""
         if not self.held:
             self.note("no flight is held out: the last weights will be kept, not the best")
         self.store = store_frames(
-            flights,
+            self.flights,
             folder / "data",
             settings.image_size,
             progress=lambda done: self.report_work(f"decoding, {done:.0%}"),
@@ -112,6 +113,10 @@ class TrainingRun(ABC, Generic[M, B]):
         self._begun_s = hooks.now_s()
 
     # ---- for subclasses ----
+
+    @abstractmethod
+    def check(self, flight: FlightData) -> None:
+        """Raise DatasetError if nothing can be learned from a flight."""
 
     @abstractmethod
     def encoder(self, trainee: M) -> nn.Module:
@@ -169,6 +174,21 @@ class TrainingRun(ABC, Generic[M, B]):
             self._train(stage)
         self._validate(self.stages[-1])
         return TrainResult(checkpoint=self.settings.out, steps=self.step, validation=self._best)
+
+    def _useful(self, flights: Sequence[FlightData]) -> list[FlightData]:
+        useful, errors = [], []
+        for flight in flights:
+            try:
+                self.check(flight)
+            except DatasetError as error:
+                errors.append(error)
+            else:
+                useful.append(flight)
+        if errors and not useful:
+            raise errors[0]
+        for error in errors:
+            self.note(f"left out: {error}")
+        return useful
 
     def _freeze_encoder(self) -> None:
         """Train on features of the average encoder from now on."""

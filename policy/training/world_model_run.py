@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.networks import load_world_model, save_world_model
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.interpolation import Indices
-from policy.data.windows import find_windows
+from policy.data.windows import Windows, find_windows
 from policy.errors import PolicyError
 from policy.nets.world_model.autoencoder import to_unit
 from policy.nets.world_model.config import WorldModelConfig
@@ -61,21 +61,25 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         self._config = config
         model = _starting_model(config, settings)
         super().__init__(flights, model, world_model_stages(settings), hooks, folder)
-        windows = find_windows(
-            flights,
-            context_frames=config.context_frames,
-            frames=config.frames,
-            frame_dt_s=config.frame_dt_s,
-        )
-        flight_of = np.repeat(np.arange(len(flights)), self.store.counts)
+        windows = self._windows_of(self.flights)
+        flight_of = np.repeat(np.arange(len(self.flights)), self.store.counts)
         kept, held = (np.isin(flight_of, chosen) for chosen in (self.kept, self.held))
         self._images_to_learn = int(kept.sum())
         self._windows = windows.among(np.flatnonzero(kept))
         self._held = windows.among(np.flatnonzero(held)).spread(VALIDATION_WINDOWS)
         self._latents: FeatureStore | None = None
         self._held_batches: list[WindowBatch] = []
-        if len(self._windows) == 0:
-            raise DatasetError("only flights that are held out are long enough: add more flights")
+
+    def check(self, flight: FlightData) -> None:
+        self._windows_of([flight])
+
+    def _windows_of(self, flights: Sequence[FlightData]) -> Windows:
+        return find_windows(
+            flights,
+            context_frames=self._config.context_frames,
+            frames=self._config.frames,
+            frame_dt_s=self._config.frame_dt_s,
+        )
 
     def encoder(self, trainee: WorldModel) -> nn.Module:
         return trainee.autoencoder

@@ -15,7 +15,7 @@ from helpers.flight_folders import write_spot_flight
 from helpers.training_runs import make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
-from policy.data.flight_data import FlightData
+from policy.data.flight_data import DatasetError, FlightData, hold_out
 from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
@@ -111,6 +111,19 @@ def test_a_run_stopped_before_its_first_validation_overwrites_nothing(flights, t
     with pytest.raises(TrainingStoppedError, match="nothing is kept"):
         train_policy(flights, NETWORK, asked, make_hooks(should_stop=asked.work_folder.exists))
     assert asked.out.read_bytes() == b"of an earlier run"
+
+
+def test_a_flight_of_no_use_is_left_out_whether_or_not_it_would_be_held_out(flights, tmp_path):
+    asked = settings(tmp_path, steps=2, validations=1)
+    held = hold_out(flights, asked.validation_fraction, asked.seed)[1][0]
+    blind = replace(flights[held], name="blind", captured_ns=flights[held].captured_ns - 10**10)
+    notes: list[str | None] = []
+    mixed = [*flights[:held], blind, *flights[held + 1 :]]
+    result = run(mixed, asked, lambda progress: notes.append(progress.note))
+    assert result.validation is not None
+    assert any(note is not None and "left out: blind: none of 18 images" in note for note in notes)
+    with pytest.raises(DatasetError, match="blind: none of 18 images"):
+        run([blind], asked)
 
 
 def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
