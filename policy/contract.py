@@ -18,8 +18,6 @@ from policy.files import parse_object
 
 CONTRACT_VERSION, OLDEST_VERSION = 6, 4
 """Version of contracts that are written, and the oldest version that can be read."""
-CONTRACT_FILE = "mavbridge.toml"
-"""File name of a contract beside a policy or dataset, where flights find it without --contract."""
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -98,10 +96,8 @@ ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
 }
 LEAST = 1e-3
 """Least time in seconds, and least value of any other quantity that is a divisor."""
-LEAST_RATE_HZ = 0.01
 MOST_PIXEL = 10.0
 """Largest mean and standard deviation of an image; its pixels are in [0, 1]."""
-MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
 LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
@@ -123,7 +119,7 @@ _INTEGERS = {
 }
 _NUMBERS: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("chunk_dt_s", "history_dt_s", "observation_dt_s"), (LEAST, 1.0, "seconds")),
-    **dict.fromkeys((*_CHUNK_AGES, "max_stall_s"), (LEAST, MAX_AGE_LIMIT_S, "seconds")),
+    **dict.fromkeys((*_CHUNK_AGES, "max_stall_s"), (LEAST, 60.0, "seconds")),
     "max_tilt_deg": (LEAST, 180.0, "degrees"),
     "max_speed_mps": (LEAST, 1e3, "m/s"),
     "max_height_m": (LEAST, 1e5, "m"),
@@ -287,10 +283,9 @@ class Contract:
         ):
             rgb = getattr(self, name)
             is_right = len(rgb) == 3 and all(_is_within(value, low, MOST_PIXEL) for value in rgb)
-            wanted = f"three numbers in [{low:g}, {MOST_PIXEL:g}], for pixels in [0, 1]"
-            yield name, is_right, wanted
-            wanted = "left out: image_channels 'depth' gives metres as they are"
-            yield name, not self.is_depth or rgb == usual, wanted
+            yield name, is_right, f"3 numbers in [{low:g}, {MOST_PIXEL:g}], for pixels in [0, 1]"
+            is_free = not self.is_depth or rgb == usual
+            yield name, is_free, "left out: image_channels 'depth' gives metres as they are"
         crop, names, extras = self.image_crop, self.cameras, self.state_extras
         is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
         is_crop = is_crop and min(crop[2] - crop[0], crop[3] - crop[1]) >= LEAST
@@ -299,9 +294,9 @@ class Contract:
         are_names = len(names) > 0 and len(set(names)) == len(names)
         are_names = are_names and all(map(str.isidentifier, names))
         yield "cameras", are_names, "one or more different names"
-        are_rates = all(_is_within(hz, LEAST_RATE_HZ, 240) for hz in self.camera_rates_hz)
+        are_rates = all(_is_within(hz, 0.01, 240) for hz in self.camera_rates_hz)
         are_rates = are_rates and len(self.camera_rates_hz) in (0, len(names))
-        wanted = f"a rate in [{LEAST_RATE_HZ:g}, 240] Hz for each of {names}"
+        wanted = f"a rate in [0.01, 240] Hz for each of {names}"
         yield "camera_rates_hz", are_rates, wanted
         are_extras = len(set(extras)) == len(extras) and set(extras) <= set(EXTRA_NAMES)
         yield "state_extras", are_extras, f"some of {', '.join(EXTRA_NAMES)}, each once"

@@ -17,8 +17,8 @@ from policy.adapters.drafts import (
 )
 from policy.adapters.interface import UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE
-from policy.contract import CONTRACT_FILE
 from policy.data.lerobot import is_lerobot
+from policy.files import CONTRACT_FILE
 
 
 def contract(source: Path, config: ContractConfig) -> int:

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policy.adapters.interface import Interface, read_interface
-from policy.contract import CONTRACT_FILE, Contract
+from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
-from policy.files import last_line, parse_json, read_text, stand_in, why_unreadable
+from policy.files import CONTRACT_FILE, last_line, parse_json, read_text, stand_in, why_unreadable
 
 if TYPE_CHECKING:
     import openvino as ov

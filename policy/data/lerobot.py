@@ -18,7 +18,6 @@ from av.video.reformatter import VideoReformatter
 
 from policy.contract import (
     ACTION_NAMES,
-    CONTRACT_FILE,
     NS_PER_S,
     SPECIFIC_FORCE,
     STATE_NAMES,
@@ -32,7 +31,7 @@ from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArr
 from policy.data.flight_video import rgb_pixels
 from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
 from policy.errors import ContractError
-from policy.files import library_name, read_object, read_toml, why_unreadable
+from policy.files import CONTRACT_FILE, library_name, read_object, read_toml, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
 """Path templates: fields with these names, a few digits wide."""

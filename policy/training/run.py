@@ -176,18 +176,18 @@ class TrainingRun(ABC, Generic[M, B]):
         return TrainResult(checkpoint=self.settings.out, steps=self.step, validation=self._best)
 
     def _useful(self, flights: Sequence[FlightData]) -> list[FlightData]:
-        useful, errors = [], []
+        useful, refused = [], []
         for flight in flights:
             try:
                 self.check(flight)
             except DatasetError as error:
-                errors.append(error)
+                refused.append(error)
             else:
                 useful.append(flight)
-        if errors and not useful:
-            raise errors[0]
-        for error in errors:
-            self.note(f"left out: {error}")
+        if refused and not useful:
+            raise refused[0]
+        for reason in refused:
+            self.note(f"left out: {reason}")
         return useful
 
     def _freeze_encoder(self) -> None:

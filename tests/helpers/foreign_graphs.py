@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from policy.adapters.description import DESCRIPTION
-from policy.contract import CONTRACT_FILE
+from policy.files import CONTRACT_FILE
 
 IMAGE_PX = 32
 CONTRACT = f"""[contract]

@@ -25,7 +25,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import BODY_STATE_NAMES
-from policy.contract import ACTION_DIM, CONTRACT_FILE, STATE_NAMES
+from policy.contract import ACTION_DIM, STATE_NAMES
 from policy.data import lerobot_format as names
 from policy.data.flight_data import (
     DatasetError,
@@ -35,7 +35,7 @@ from policy.data.flight_data import (
 )
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.interpolation import MAX_GAP_NS
-from policy.files import read_object
+from policy.files import CONTRACT_FILE, read_object
 
 MAX_HELD_NS = MAX_GAP_NS
 """A state or sticks older than this no longer belong to a frame."""

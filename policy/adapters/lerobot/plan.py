@@ -15,10 +15,10 @@ import numpy as np
 
 from policy.adapters.interface import Interface, read_interface
 from policy.adapters.lerobot.config import Config, Features, read_config, read_json
-from policy.contract import ACTION_DIM, CONTRACT_FILE, Contract, FloatArray
+from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.data.lerobot_format import ACTION_KEY, STATE_KEY
 from policy.errors import CheckpointError, ContractError, warned
-from policy.files import open_safetensors
+from policy.files import CONTRACT_FILE, open_safetensors
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 WEIGHTS_FILE = "model.safetensors"
