@@ -54,7 +54,7 @@ def test_shapes_grow_by_cameras_observations_and_extras() -> None:
         ({"prefix_len": 4, "state_time": "execution"}, "0 if state_time is 'execution', got 4"),
         ({"version": 3}, "version 3 is not supported"),
         ({"horizon": 0}, "horizon must be an integer in"),
-        ({"image_std_rgb": [0.2, 0.2, 0.0]}, "three numbers in"),
+        ({"image_std_rgb": [0.2, 0.2, 0.0]}, "3 numbers in"),
         ({"image_mean_rgb": [123.7, 116.3, 103.5]}, r"in \[-10, 10\], for pixels in \[0, 1\]"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"action": "torque"}, "action must be .*'velocity', got 'torque'"),
