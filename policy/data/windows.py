@@ -87,12 +87,17 @@ def find_windows(
         first += len(state)
     every = np.concatenate(windows)
     if len(every) == 0:
-        gaps_ms = np.concatenate([np.diff(flight.captured_ns) / 1e6 for flight in flights])
-        pace_ms = np.median(gaps_ms) if len(gaps_ms) else np.nan
+        count = context_frames + frames
+        gaps_ns = np.concatenate([np.diff(flight.captured_ns) for flight in flights])
+        gap_ns = max(np.median(gaps_ns), NS_PER_S // 1000) if len(gaps_ns) else dt_ns
+        long_ns = np.arange(0, 2 * count * dt_ns, gap_ns)
+        advice = "fly longer"
+        if len(_evenly_spaced(long_ns, np.ones(len(long_ns), bool), count, dt_ns)) == 0:
+            hz = 1 / frame_dt_s
+            advice = f"record {hz:.0f} images a second, or {2 * hz:.0f} and more"
         raise DatasetError(
-            f"none of {len(flights)} flights holds {context_frames + frames} frames with states, "
-            f"{1e3 * frame_dt_s:.0f} ms apart (theirs are {pace_ms:.0f} ms apart): "
-            "fly longer, or choose another frame_dt_s"
+            f"{flights[0].name}: no {count} frames with states, {dt_ns / 1e6:.0f} ms apart (its "
+            f"{len(flights[0].captured_ns)} frames are {gap_ns / 1e6:.0f} ms apart): {advice}"
         )
     return Windows(
         frames=every,

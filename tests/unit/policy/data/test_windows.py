@@ -74,8 +74,15 @@ def test_states_are_those_of_the_exposures_and_follow_the_actions() -> None:
     assert met.mean() > 0.9  # not where it turns or changes its mind on the way
 
 
-def test_flights_without_a_window_are_refused() -> None:
-    with pytest.raises(DatasetError, match="33 ms apart"):
-        windows_of(steered_flight(0, seconds=0.3))
-    with pytest.raises(DatasetError, match="choose another frame_dt_s"):
-        windows_of(steered_flight(0), dt_s=0.02)
+@pytest.mark.parametrize(
+    ("every", "dt_s", "says"),
+    [
+        (1, 0.1, "steered 0: no 6 frames with states.*33 ms apart.: fly longer"),
+        (2, 0.1, "66 ms apart.: record 10 images a second, or 20 and more"),
+        (1, 0.02, "record 50 images a second, or 100 and more"),
+    ],
+)
+def test_a_flight_without_a_window_is_refused(every: int, dt_s: float, says: str) -> None:
+    flight = steered_flight(0, seconds=0.3 * every)
+    with pytest.raises(DatasetError, match=says):
+        windows_of(without(flight, *np.flatnonzero(np.arange(91) % every)), dt_s=dt_s)
