@@ -130,7 +130,7 @@ class Timeline:
         self._sent = np.concatenate([part for e in flights for part in (neutral, e.sent)])
         self.captured_ns = stamps("captured_ns")
         self.gate = np.concatenate([flight.gate for flight in flights]).reshape(-1, GATE_DIM)
-        self._usable_ticks = np.flatnonzero(self.chunks(np.arange(len(self.tick_ns)))[1][:, 0])
+        self._usable_ticks = np.flatnonzero(covered(self._target_ns, self._attitude_ns))
         self.frames, self._any_tick = self._usable_frames()
         if len(self.frames) == 0:
             low_ms, high_ms = ages_ns[[0, -1]] / 1e6
