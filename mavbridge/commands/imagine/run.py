@@ -131,9 +131,9 @@ def run_rollout(
             return stop.is_set() and done < plan.iterations
     except MavbridgeError as error:
         output.close()
-        left = "nothing was written"
-        if output.out.exists() or output.out.with_suffix(".arrows").exists():
-            left = f"{output.out} and its rows hold what was written before, and are readable"
+        files = (output.out, output.out.with_suffix(".arrows"))
+        made = " and ".join(str(file) for file in files if file.exists())
+        left = f"what was written before is readable in {made}" if made else "nothing was written"
         raise RolloutError(f"{error}; {left}") from error
     except BaseException:
         output.close()

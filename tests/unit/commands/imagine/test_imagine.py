@@ -109,4 +109,6 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     status, text = imagine("--n-iter", "100")
     assert status == 2
     assert "the writer process has died" in text
-    assert "are readable" in text
+    left = text.split("is readable in ")[1].split()[::2]
+    assert left[-1].endswith("a.arrows")
+    assert all(Path(name).exists() for name in left)
