@@ -120,14 +120,18 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
 def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightData]:
     camera_key = settings.camera_key
     datasets = [path for path in paths if is_lerobot(path)]
-    if camera_key is not None and not datasets:
-        raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
     own = [path for path in paths if path not in datasets]
     folders = find_flights(own) if own else []
     folders, note = leave_out_failed(folders, include_failed=settings.include_failed)
     console = text_console(stderr=True)
     if note is not None:
         console.print(note, soft_wrap=True)
-    flights = [read_flight(folder) for folder in folders]
+    flights = [read_flight(folder, camera_key) for folder in folders]
+    several = [flight for flight in flights if len(flight.contract.cameras) > 1]
+    if several and camera_key is None:
+        name, cameras = several[0].name, list(several[0].contract.cameras)
+        raise UserError(f"{name}: several cameras {cameras}: name one by --camera-key")
+    if camera_key is not None and not (several or datasets):
+        raise UserError("--camera-key names one of several cameras; these flights have one")
     print_warnings(console, [text for flight in flights for text in flight.damage])
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

@@ -26,7 +26,6 @@ from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
-VIDEO = "camera.mp4"
 
 _AGE_COLUMNS = ("woke_ns", "chunk_computed_ns", "predict_ns", "feature_captured_ns")
 _TICK_COLUMNS = (
@@ -124,25 +123,27 @@ def leave_out_failed(
     return exemplary, f"left out: {failed} of {len(folders)} flights that failed ({why}): {advice}"
 
 
-def read_flight(folder: Path) -> FlightData:
-    """Read one flight folder, complete or left by a crash, with the images of its first camera.
+def read_flight(folder: Path, camera: str | None = None) -> FlightData:
+    """Read one flight folder, complete or left by a crash, with one camera's images.
 
     The sticks to imitate are the ``expert`` column if there is one; otherwise the pilot's after
     taking over from the policy; otherwise those that the policy flew; in a flight that sent nothing
     (``--readonly``), the pilot's. A pilot's count only in a mode of the contract: in another mode
-    the same stick means something else.
+    the same stick means something else. ``camera`` is one of several, by default the first.
     """
     name, meta = str(folder), _read_meta(folder)
     contract = _contract(name, meta)
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
-    damage = [
-        f"{folder}: camera {other} is left out, only the first is read"
-        for other in contract.cameras[1:]
-    ]
+    first, *others = contract.cameras
+    unread = others if camera is None else []
+    damage = [f"{folder}: camera {other} is left out, only the first is read" for other in unread]
+    if others and camera not in (None, first, *others):
+        raise DatasetError(f"{folder}: no camera {camera}; it has {[first, *others]}")
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
-    frames, numbers = _read_table(folder, "frames", _FRAME_COLUMNS, damage)
-    video = folder / VIDEO
+    suffix = f"_{camera}" if camera in others else ""
+    frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
+    video = folder / f"camera{suffix}.mp4"
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     try:

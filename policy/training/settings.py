@@ -74,7 +74,7 @@ class RunSettings:
     """Also flights that crashed, were cut off, ended by a fault, were marked as bad, or missed
     gates."""
     camera_key: str | None = None
-    """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
+    """Which of several cameras, e.g. front, or observation.images.front in LeRobot."""
 
     def __post_init__(self) -> None:
         if self.out.suffix != ".safetensors":

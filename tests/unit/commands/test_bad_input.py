@@ -1,7 +1,7 @@
 """What a user can get wrong: one message each, never a traceback, and no file is touched."""
 
 import shlex
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -107,7 +107,9 @@ BAD = [
     (f"{TRAIN} --ages 90:40", "LOW:HIGH"),
     (f"{TRAIN} --steps 1 --minutes 1", "contradict"),
     (f"{TRAIN} --start-from b.safetensors", "no such file"),
-    (f"{TRAIN} --camera-key front", "flights have one camera"),
+    (f"{TRAIN} --camera-key front", "these flights have one"),
+    ("train two --out a.safetensors", "several cameras ['down', 'front']: name one by"),
+    ("train two --out a.safetensors --camera-key up", "no camera up; it has ['down'"),
     (f"{TRAIN} --policy=world-model --pack", "has a command of its own"),
     (f"{TRAIN_WORLD} --ages 40:90", "Unknown option"),
     (f"{TRAIN_WORLD} --start-from b.safetensors", "no such file"),
@@ -135,6 +137,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_flight(folder / "flight")
     write_flight(folder / "enu", meta=make_meta(contract=ENU))
     write_spot_flight(folder / "spots", 0, seconds=0.3)
+    two = write_spot_flight(folder / "two", 0, seconds=0.3)
+    write_meta(two, contract=asdict(Contract(cameras=("down", "front"))))
     write_meta(folder / "foreign", format="something else")
     (folder / "empty").mkdir()
     (folder / "left.unfinished").mkdir()

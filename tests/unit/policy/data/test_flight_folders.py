@@ -68,6 +68,18 @@ def test_cameras_that_are_not_read_are_named(tmp_path: Path) -> None:
     )
 
 
+def test_one_of_several_cameras_is_read(tmp_path: Path) -> None:
+    meta = contract(cameras=["down", "front"])
+    folder, other = (flight(tmp_path / name, meta) for name in "ab")
+    frames = pa.table({"captured_ns": [5 * MS, 38 * MS]})
+    pq.write_table(frames, folder / "frames_front.parquet")
+    (other / "camera.mp4").rename(folder / "camera_front.mp4")
+    for camera, first_ns in ((None, 0), ("down", 0), ("front", 5 * MS)):
+        episode = read_flight(folder, camera)
+        assert episode.captured_ns[0] == first_ns
+        assert len(list(episode.decode())) == 2
+
+
 def test_a_tick_counts_as_the_decision_behind_it_and_as_no_later_than_the_next(
     tmp_path: Path,
 ) -> None:
