@@ -67,8 +67,8 @@ def test_the_end_is_not_learned_from_flights_without_gates(
     for name in ("blind", "sighted"):
         write_spot_flight(flights / name, 0, seconds=0.3)
 
-    def read(folder: Path) -> FlightData:
-        flight = read_flight(folder)
+    def read(folder: Path, camera: str | None) -> FlightData:
+        flight = read_flight(folder, camera)
         unknown = np.full_like(flight.gate, np.nan)
         return replace(flight, gate=unknown) if folder.name == "blind" else flight
 
