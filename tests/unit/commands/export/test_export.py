@@ -210,7 +210,10 @@ def _other_clock(root: Path) -> None:
         (_flights({}, {"period_ms": 66}), "export them apart"),
         (_flights({"period_ms": 640, "frames": 5}), "have 1.56 frames a second"),
         (_flights({}, {"contract": {"state_frame": "enu_flu"}}), "one kind at a time"),
-        (_flights({}, {"contract": {"yaw_dead_zone": 0.0}}), "yaw_dead_zone 0.04"),
+        (
+            _flights({}, {"contract": {"state_frame": "ned_frd", "yaw_dead_zone": 0.0}}),
+            "yaw_dead_zone 0.04",
+        ),
         (_flights({"success": False}), "have failed"),
         (_flights({"video_frames": 1}), "nothing to export"),
         (_other_clock, "of one clock"),
