@@ -304,7 +304,7 @@ class ArduCopter(Autopilot):
         changed = self.radio_failsafe.update(
             new_input=new_input,
             throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
-            can_fail=self.rc.has_receiver or self.armed,
+            can_fail=self.rc.found or self.armed,
             now_ns=self.now_ns,
         )
         if not changed:

@@ -47,10 +47,6 @@ class RcEngine:
         self.found = receiver_us is not None  # has a receiver, or an override has come
 
     @property
-    def has_receiver(self) -> bool:
-        return self._receiver_us is not None
-
-    @property
     def channel_count(self) -> int:
         return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
 

@@ -97,6 +97,21 @@ def test_without_a_receiver_no_takeover_leaves_a_lean_behind(
     assert all(us[0] == us[1] == us[3] == 1500 for us in sticks)
 
 
+def test_a_second_flight_without_a_receiver_is_held_at_its_end_as_the_first_was() -> None:
+    """The end of an earlier flight's overrides is a radio failsafe while disarmed, too."""
+    flight = GuardFlight(climbing_first, receiver_us=None, arm=True)
+    flight.ap.rc.override((1500,) * 4, flight.ap.now_ns)
+    flight.run(0.1)
+    flight.ap.rc.override((0,) * 4, flight.ap.now_ns)
+    flight.until(lambda: flight.ap.in_failsafe, within_s=1.1)
+    flight.take_off(2.5)
+    flight.stop()
+    flight.run(2.0)
+    assert flight.phase is Phase.HOLDING, flight.describe()
+    assert flight.ap.mode is Mode.LAND
+    assert not flight.ap.in_failsafe
+
+
 def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
     """For a takeoff of five seconds that ends in a lean."""
     return (0.7, 0.0, 0.0, 0.0) if t_s < 3 else (0.2, 0.0, 0.0, 0.5)
