@@ -224,7 +224,7 @@ class StickSpeeds:
 
 
 class ManualControlOutput(StickOutput):
-    """MANUAL_CONTROL, whose release is silence, after one neutral packet if no other has sticks.
+    """MANUAL_CONTROL, whose release is silence after one neutral packet.
 
     PX4 takes the silence for lost sticks if it received only ours.
     """
@@ -290,12 +290,12 @@ class ManualControlOutput(StickOutput):
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Encode one level packet in modes flown by sticks, with the last throttle in thrust modes.
 
-        Return None if a receiver has sticks. After a session restart the last known status counts:
-        a reboot may be only a wrong timestamp, and without this packet the vehicle would fly on
-        with the policy's last sticks for COM_RC_LOSS_T.
+        Without this packet the vehicle would fly on with the policy's last sticks for
+        COM_RC_LOSS_T, also with a receiver. After a session restart the last known status counts:
+        a reboot may be only a wrong timestamp.
         """
         status = vehicle.status(now_ns) or self._status
-        if status is None or status.has_receiver or status.mode not in _MODES:
+        if status is None or status.mode not in _MODES:
             return None
         z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
         return self._codec.encode_manual_control(

@@ -155,12 +155,12 @@ NEUTRAL_SENT = (0, 0, 500, 0)
     [
         ("ALTCTL", False, NEUTRAL_SENT),
         ("STABILIZED", False, (0, 0, 650, 0)),  # where the middle of the throttle is thrust
-        ("ALTCTL", True, None),
+        ("ALTCTL", True, NEUTRAL_SENT),  # which PX4 prefers to the receiver until it is lost
         ("AUTO.LOITER", False, None),  # which would take them for a pilot's hand
         ("OFFBOARD", False, None),
     ],
 )
-def test_the_last_sticks_are_neutral_ones_where_nobody_elses_are_flown(
+def test_the_last_sticks_are_neutral_ones_where_sticks_are_flown(
     mode: str, has_receiver: bool, last: tuple[int, ...] | None, is_restarted: bool
 ) -> None:
     """Also of a session that starts over in the air: a reboot may be but a wrong stamp."""
