@@ -25,9 +25,9 @@ FAST_SAMPLES = 3
 Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
 OLD_TAU_S, TAU_S = 0.1, 0.05  # low-pass of a stick's speed, before 1.18 and in 1.18
 
-_RECEIVER_ONLY, _LINKS_ONLY, _KEEP_FIRST, _NONE = 0, 1, 3, 4
-"""Values of COM_RC_IN_MODE. Any other takes any source, and keeps it until it is lost: the
-priorities of 5 to 8 are not imitated."""
+_RECEIVER_ONLY, _LINKS_ONLY, _KEEP_FIRST, _NONE, *_PRIORITIES = 0, 1, 3, 4, 5, 6, 7, 8
+"""Values of COM_RC_IN_MODE. 2 takes any source, and keeps it until it is lost. From 5 on a source
+replaces a lower one at once: 6 and 8 prefer links to the receiver, 7 and 8 the highest link."""
 
 
 EXPO = 0.6
@@ -84,6 +84,8 @@ class StickInput:
         """A stick moves faster than COM_RC_STICK_OV or MAN_OVERRIDE_SPD."""
         self._source: int | None = None
         self._first_source: int | None = None
+        self._unread: dict[int, Px4Sticks] = {}
+        """Samples of sources that did not win, since the last check."""
         self._never_ages = False
         self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         self._looked_ns = 0
@@ -105,16 +107,21 @@ class StickInput:
             if self._first_source is None:
                 self._first_source = source
             self._choose(sticks, now_ns)
+        else:
+            self._unread[source] = sticks
 
     def update(self, now_ns: int) -> None:
         """Check sticks between arrivals, and detect the loss of the winner."""
+        if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
+            unread, self._unread, self.valid = self._unread, {}, False
+            for source, sticks in unread.items():  # one that follows in this check: no failsafe
+                self.on_sticks(source, sticks, now_ns)
+            if not self.valid:
+                self.moved_fast = False
+                self.gesture.see(0, now_ns)
+                self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         if self.valid and now_ns - self._looked_ns >= POLL_NS:
             self._look(now_ns)
-        if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
-            self.valid = False
-            self.moved_fast = False
-            self.gesture.see(0, now_ns)
-            self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
 
     @property
     def _lost_after_ns(self) -> int:
@@ -127,12 +134,16 @@ class StickInput:
             return False
         if mode == _KEEP_FIRST:
             return self._first_source in (None, source)
-        return not self.valid or self._never_ages or source == self._source
+        if not self.valid or self._never_ages or self._source is None or source == self._source:
+            return True
+        prefers_higher = mode in ((6, 8) if RC_SOURCE in (source, self._source) else (7, 8))
+        return mode in _PRIORITIES and prefers_higher is (source > self._source)
 
     def _look(self, now_ns: int) -> None:
         """Detect movement since the last check, by the detector of the release."""
         is_old = "COM_RC_STICK_OV" in self._params
         dt_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
+        self._unread.clear()
         limit = self._params["COM_RC_STICK_OV" if is_old else "MAN_OVERRIDE_SPD"]
         limit_per_s = 0.01 * limit if is_old else limit
         moves = 0 if is_old else FAST_SAMPLES

@@ -37,6 +37,24 @@ def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
 
 
 @pytest.mark.parametrize(
+    ("in_mode", "order"),
+    [
+        (5, (RC_SOURCE, GCS, ONBOARD)),
+        (6, (GCS, ONBOARD, RC_SOURCE)),
+        (7, (RC_SOURCE, ONBOARD, GCS)),
+        (8, (ONBOARD, GCS, RC_SOURCE)),
+    ],
+)
+def test_a_preferred_source_wins_at_once_and_its_end_is_noticed_after_600_ms(in_mode, order):
+    senders = Senders(in_mode)
+    for count in (1, 2, 3):
+        assert senders.send(0.02, *order[-count:]) == order[-count]
+    assert senders.send(0.56, *order[1:]) == order[0]
+    assert senders.send(0.1, *order[1:]) == order[1]
+    assert senders.send(0.7, order[2]) == order[2]
+
+
+@pytest.mark.parametrize(
     ("in_mode", "source"), [(0, RC_SOURCE), (1, GCS), (2, RC_SOURCE), (4, None)]
 )
 def test_the_input_mode_selects_the_receiver_or_a_link(in_mode, source):
