@@ -14,7 +14,7 @@ _CONTROLLED_BY = {
     Phase.PREPARING: "the pilot, or idle or neutral sticks: [the way in](#the-way-in)",
     Phase.FLYING: "the policy",
     Phase.LEAVING: "neutral sticks or setpoints, until a safe mode is confirmed",
-    Phase.HOLDING: "neutral sticks, since silence would be a failsafe",
+    Phase.HOLDING: "neutral sticks: a release would be unsafe",
     Phase.RELEASING: "nobody: a release is sent every 50 ms, also after the link was reopened",
     Phase.RELEASED: "the pilot; nothing is sent. Continues as in WAITING",
     Phase.ENDED: "the pilot; a disarmed vehicle gets back the parameters of `--set` (4 s at most), "

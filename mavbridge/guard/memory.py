@@ -85,6 +85,8 @@ class Memory:
     is_arming_awaited: bool | None = None
     """True until the vehicle is armed for the first time; None until it is seen disarmed or armed,
     at first and after a silence."""
+    heeds_switch: bool = False
+    """True if a hand may still put the engage switch low, to end LEAVING and HOLDING."""
     switch: Switch = field(default_factory=lambda: Switch(rest_ns=REST_NS))
 
     @property
@@ -153,6 +155,7 @@ class Memory:
         self._note_end(cause)
         self.reason = cause.reason
         self.must_stop = cause != self.end_request
+        self.heeds_switch = not (self.switch.is_off or self.settings.is_setpoint)
         if cause.end == "takeover":
             self.seen_interruptions = now.link.interruptions
         self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal

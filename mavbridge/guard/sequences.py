@@ -327,7 +327,9 @@ class DisengageSequence:
         ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: known.
         """
         is_confirmed = self.mode is None or now.status.mode == self.mode
-        is_safe = self.may_release or (self.mode is not None and is_confirmed)
+        # PX4's safe modes give way to a stick that is not in the middle when its receiver follows.
+        is_kept = self.mode is not None and is_confirmed and not now.link.modes.override
+        is_safe = self.may_release or is_kept
         self.must_hold = not self.settings.is_setpoint and (self.is_silence_failsafe or not is_safe)
         if unheard_ns is not None:  # the timeout starts when the vehicle is heard
             self.asks_until_ns = now.now_ns + MODE_TIMEOUT_NS

@@ -121,8 +121,8 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
     was disarmed, rebooted, is in a failsafe that changes the mode (PX4: any) or follows other
     sticks; the override switch is low (setpoints ignore it); the engage switch is low (in flight or
-    while engaging); the vehicle is silent while another one uses its system id; or a relevant
-    parameter was changed.
+    while engaging; PX4: while held); the vehicle is silent while another one uses its system id; or
+    a relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -297,7 +297,10 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return now.link.problem
     if now.link.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
-    if m.switch.is_off and (m.phase is Phase.FLYING or (is_preparing and m.is_act)):
+    # PX4 ignores the transmitter's own switches until its receiver follows our sticks.
+    has_fallback = bool(now.link.modes.override) and not m.disengage.is_silence_failsafe
+    is_held = m.phase in (LEAVING, HOLDING) and m.heeds_switch and has_fallback
+    if m.switch.is_off and (m.phase is FLYING or (is_preparing and m.is_act) or is_held):
         return _switch_off(m)
     if not now.status.armed and not is_preparing:
         return because(Code.DISARMED)

@@ -114,6 +114,7 @@ def test_a_px4_is_told_what_its_sticks_cannot_do(receiver: bool) -> None:
 
     assert "no-go" not in verdicts(rows).values(), verdicts(rows)
     assert rows["modes"].found == "ALTCTL"
+    assert rows["radio receiver"].found.split()[0] == ("ignored" if receiver else "none")
     assert "sticks are mapped" in rows["full lean"].found
     assert rows["full yaw rate"].verdict == "warn"
     assert "202 deg/s" in rows["full yaw rate"].advice

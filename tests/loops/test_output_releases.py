@@ -19,6 +19,7 @@ from policy.contract import ActionKind
 from policy.motion.controllers import Motion, Program, Push
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.px4.modes import Phase as LostPhase
+from sitl.px4.sticks import RC_SOURCE
 from sitl.vehicle.config import AutopilotName, Px4Release
 
 FULL_YAW = Program(motion=lambda _: Motion(push=Push("yaw", 1.0)))
@@ -164,6 +165,44 @@ def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     assert "POSCTL" not in after, flight.describe()
     is_dead = end is OutputFlight.die
     assert flight.px4.mode_name == ("AUTO.LOITER" if is_dead else "AUTO.LAND")
+
+
+@pytest.mark.parametrize(
+    ("end", "throttle_us", "mode"),
+    [
+        (None, 1500, "ALTCTL"),
+        (None, 1000, "ALTCTL"),
+        (OutputFlight.die, 1500, "ALTCTL"),
+        (OutputFlight.kill_guard, 1500, "ALTCTL"),
+        (OutputFlight.die, 1000, "AUTO.LOITER"),  # to whose throttle it is not released unasked
+        (OutputFlight.stop, 1000, "AUTO.LAND"),
+    ],
+)
+def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_the_switch(
+    end: Callable[[OutputFlight], None] | None, throttle_us: int, mode: str
+) -> None:
+    """Until then it ignores the transmitter's switches too, but for our engage switch."""
+    flight = OutputFlight("px4", "sticks", engage_channel=5)
+    mapped = {f"RC_MAP_{axis}": k for k, axis in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)}
+    for name, value in {"COM_RC_IN_MODE": 6, **mapped}.items():
+        assert flight.vehicle.params.set(name, value)
+    sticks_us = (1500, 1500, throttle_us, 1500)
+    flight.vehicle.set_receiver((*sticks_us, 1000))
+    flight.launch().run(0.3)
+    flight.vehicle.set_receiver((*sticks_us, 2000))
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=1.0)
+    flight._begin_program()
+    flight.run(1.2)
+    assert flight.px4.stick_input.source != RC_SOURCE
+    if end is not None:
+        end(flight)
+        flight.run(1.2)
+        assert flight.px4.mode_name == mode, flight.describe()
+        assert (flight.phase is Phase.HOLDING) is (throttle_us == 1000)
+    flight.vehicle.set_receiver((*sticks_us, 1000))
+    flight.run(0.8)
+    assert flight.px4.stick_input.source == RC_SOURCE, flight.describe()
+    assert not any(sample.failsafe for sample in flight.samples)
 
 
 def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:

@@ -327,7 +327,7 @@ def _vehicle_rows(
             no_go=lacking if terms.mode is None else "",
         )
     if status is not None:
-        yield from _status_rows(status)
+        yield from _status_rows(vehicle, status)
     if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
         refuses = (
             "the autopilot would refuse to arm now; it says why as PreArm texts, also to a ground "
@@ -339,7 +339,7 @@ def _vehicle_rows(
         yield _row("override switch", "off", "on", warn=str(vehicle.switch_problem))
 
 
-def _status_rows(status: VehicleStatus) -> Iterator[CheckRow]:
+def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[CheckRow]:
     found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
     if status.is_failsafe:
         text = "a failsafe of the vehicle is active"
@@ -349,7 +349,7 @@ def _status_rows(status: VehicleStatus) -> Iterator[CheckRow]:
         yield _row("state", found, "disarmed", warn=text)
     else:
         yield _row("state", found, "disarmed, no failsafe")
-    yield _receiver_row(status)
+    yield _receiver_row(vehicle, status)
     position = {True: "valid", False: "none", None: "the estimator does not say"}
     text = "without a position, hold is LAND, and the autopilot does not take off by itself"
     is_lacking = status.is_position_valid is False
@@ -359,8 +359,11 @@ def _status_rows(status: VehicleStatus) -> Iterator[CheckRow]:
         yield _row("battery", "low", "charged", no_go=str(status.battery_problem))
 
 
-def _receiver_row(status: VehicleStatus) -> CheckRow:
+def _receiver_row(vehicle: VehicleSession, status: VehicleStatus) -> CheckRow:
     name, expected = "radio receiver", "a pilot who can take over"
+    if vehicle.params.ignores_receiver and vehicle.condition.has_receiver:
+        text = "neither its sticks nor its switches count: set COM_RC_IN_MODE to 6 (PX4 1.17)"
+        return _row(name, "ignored by COM_RC_IN_MODE", expected, text)
     if not status.has_receiver:
         return _row(
             name,

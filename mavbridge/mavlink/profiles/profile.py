@@ -268,6 +268,10 @@ class Profile(ABC):
         """True if the vehicle ignores the sticks of a receiver, even if there is one."""
         return False
 
+    def falls_back(self, values: Mapping[str, float]) -> bool:
+        """True if a receiver's sticks count again once ours have ended, without a failsafe."""
+        return False
+
     def keeps_sticks(self, values: Mapping[str, float]) -> bool:
         """True if overrides that have ended are shown for ever, as from a healthy receiver."""
         return False

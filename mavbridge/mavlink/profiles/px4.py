@@ -49,6 +49,8 @@ _UNEVEN_HZ = 150.0
 """Rate above which a request for the rate itself yields less than one for ``FAST_HZ``."""
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
 """Values of COM_RC_IN_MODE that exclude MAVLink's sticks."""
+_MAVLINK_FIRST = (6, 8)
+"""Values of COM_RC_IN_MODE that prefer MAVLink's sticks, and without them take a receiver's."""
 _NO_RESCALE = 1
 """Value of MPC_THR_CURVE."""
 _FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
@@ -223,10 +225,14 @@ class Px4(Profile):
         """True if COM_RC_IN_MODE is 1 (sticks only from MAVLink) or 4 (no sticks)."""
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
+    def falls_back(self, values: Mapping[str, float]) -> bool:
+        """See `Profile`."""
+        return values.get("COM_RC_IN_MODE") in _MAVLINK_FIRST
+
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """See `Profile`."""
         if context.output == "manual-control":
-            yield from _stick_notes(values, context.version)
+            yield from _stick_notes(values, context)
             yield from _end_notes(values, "COM_RC_LOSS_T", "NAV_RCL_ACT", _FATAL_ACTIONS)
             yield from _exception_notes(values, _EXCEPT_HOLD, "AUTO")
         elif context.output is not None:
@@ -328,8 +334,9 @@ def _lean(tilt_deg: float, *, is_tangent: bool) -> Lean:
     return Lean(axis, axis, full, is_tangent, "MPC_MAN_TILT_MAX")
 
 
-def _stick_notes(values: Mapping[str, float], version: str | None) -> Iterator[ParamNote]:
+def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what refuses, weakens or changes sticks, and gestures a policy might make."""
+    version = context.version
     # 1.13 showed it as it was sent; a build without tags is 0.0.0.
     if version and [1, 14] <= [int(part) for part in version.split(".")] < [1, 16]:
         effect = "shows the throttle as -1000 to 1000, so that our sticks cannot be checked"
@@ -343,6 +350,12 @@ def _stick_notes(values: Mapping[str, float], version: str | None) -> Iterator[P
         why = f" ({_NO_MAVLINK_STICKS[int(mode)]})"
         or_else = " (MAVLink only), or 6 with a receiver (MAVLink first; PX4 1.17 and later)"
         yield ParamNote.of("obstacle", "COM_RC_IN_MODE", mode, why, 1, or_else)
+    if mode in _MAVLINK_FIRST and context.has_receiver:
+        effect = (
+            ": while our sticks flow PX4 ignores all switches of the transmitter: take over by "
+            "--engage-channel; they count 0.6 s later, once moved"
+        )
+        yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect)
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
         effect = (
@@ -351,10 +364,7 @@ def _stick_notes(values: Mapping[str, float], version: str | None) -> Iterator[P
         )
         yield ParamNote.of("advice", "MPC_TILTMAX_AIR", limit_deg, effect, full_deg)
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
-        effect = (
-            ": in STABILIZED the middle of the throttle is half of full thrust, and not hover "
-            "thrust"
-        )
+        effect = ": in STABILIZED the middle of the throttle is half thrust, not hover thrust"
         yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
     if values.get("MAN_ARM_GESTURE") == 1:
         effect = (

@@ -5,6 +5,7 @@ reboot of the vehicle are handled alike, and none of them blocks the action loop
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -13,7 +14,7 @@ from mavbridge.core.errors import PeerError
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
-from mavbridge.core.vehicle import Output, VehicleStatus, said_by_vehicle
+from mavbridge.core.vehicle import ModeRoles, Output, VehicleStatus, said_by_vehicle
 from mavbridge.mavlink.codec.messages import (
     RESTART_STAMPS,
     RESTART_STEP_US,
@@ -287,6 +288,14 @@ class VehicleSession:
             is_receiver_settled=self._is_receiver_settled(now_ns),
             ignores_receiver=self.params.ignores_receiver,
         )
+
+    def roles(self, now_ns: int) -> ModeRoles:
+        """Return the modes' roles; a receiver may follow our sticks without a failsafe."""
+        roles, status = self.profile.modes.roles, self.status(now_ns)
+        has_receiver = status is not None and status.has_receiver is True
+        if has_receiver and self.profile.falls_back(self.params.values):
+            return replace(roles, is_silence_failsafe=False)
+        return roles
 
     def problem(self, now_ns: int) -> Reason | None:
         """Return why the vehicle cannot be flown now with any output, or None."""

@@ -108,6 +108,8 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
             ["--set MPC_TILTMAX_AIR=35"],
         ),
         (PX4, {"MPC_THR_CURVE": 1.0}, "manual-control", None, ["--set MPC_THR_CURVE=0"]),
+        (PX4, {"COM_RC_IN_MODE": 6.0}, "manual-control", True, ["take over by --engage-channel"]),
+        (PX4, {"COM_RC_IN_MODE": 6.0}, "manual-control", False, []),
         (PX4, {"MPC_THR_CURVE": 1.0, "MPC_TILTMAX_AIR": 1.0}, "rates", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", None, []),
         (PX4, {"COM_OF_LOSS_T": 5.0}, "velocity", None, ["--set COM_OF_LOSS_T=0.5"]),
