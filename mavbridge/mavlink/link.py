@@ -124,7 +124,7 @@ class MavlinkLink:
         texts = self._connection.take_texts()
         vehicle, output = self.vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
-        modes = vehicle.roles(now_ns) if vehicle else ModeRoles()
+        modes = vehicle.roles(status) if vehicle else ModeRoles()
         problem = self._problem(now_ns)
         if vehicle is None or output is None:
             return LinkSnapshot(

@@ -289,9 +289,9 @@ class VehicleSession:
             ignores_receiver=self.params.ignores_receiver,
         )
 
-    def roles(self, now_ns: int) -> ModeRoles:
+    def roles(self, status: VehicleStatus | None) -> ModeRoles:
         """Return the modes' roles; a receiver may follow our sticks without a failsafe."""
-        roles, status = self.profile.modes.roles, self.status(now_ns)
+        roles = self.profile.modes.roles
         has_receiver = status is not None and status.has_receiver is True
         if has_receiver and self.profile.falls_back(self.params.values):
             return replace(roles, is_silence_failsafe=False)
