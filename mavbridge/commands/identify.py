@@ -23,7 +23,7 @@ from mavbridge.flight.app import fly_policy
 from mavbridge.flight.checks import check_flight, output_folders
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import configured_contract
-from mavbridge.observe.output import flight_console
+from mavbridge.observe.output import patient_console
 from policy.contract import RATE, ActionKind, Contract, FloatArray
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.motion.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps, measure
@@ -354,7 +354,7 @@ def identify(config: IdentifyConfig) -> int:
         check_flight(flight)
         policy, runner = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
         plan = plan_flight(flight, runner.contract, is_dual=runner.dual_rate)
-        fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(recording,))
+        fly_policy(plan, runner, clock=clock, console=patient_console(), sinks=(recording,))
     if policy.program_start_s is None:
         raise PeerError("the flight ended before the doublet began: there is nothing to measure")
     found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)

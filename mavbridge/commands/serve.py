@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 
-from rich.console import Console
+from rich.text import Text
 from websockets.asyncio.server import Server, ServerConnection
 from websockets.asyncio.server import serve as serve_websockets
 from websockets.exceptions import ConnectionClosed
@@ -22,12 +22,12 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mavbridge.commands.config import ServeConfig
-from mavbridge.commands.output import text_console
 from mavbridge.core.address import is_local, spelled
 from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import stop_signals
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+from mavbridge.observe.output import MessageQueue, messages_shown, patient_console
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
 from policy.adapters.websocket.messages import (
@@ -69,7 +69,7 @@ class PolicyServer:
             runner: single-rate policy, called by a thread of its own.
             clock: measures each call.
             api_key: key required of clients; None admits all that reach this computer.
-            report: gets a line for each client that connects or leaves.
+            report: gets a line for each client that connects or leaves; must not block.
         """
         self._runner = runner
         self._clock = clock
@@ -185,29 +185,32 @@ def serve(config: ServeConfig) -> int:
     """Serve a policy until a signal comes."""
     policy_config = replace(config.policy, dual_rate=False)
     check_configured_policy(policy_config)
-    console, clock = text_console(), MonotonicClock()
-    with load_configured_policy(policy_config, clock) as loaded:
+    console, clock = patient_console(stderr=False), MonotonicClock()
+    with (
+        load_configured_policy(policy_config, clock) as loaded,
+        messages_shown(console, JOIN_S) as messages,
+    ):
         for note in loaded.notes:
-            console.print(note, style="yellow")
+            messages.put(Text(note, style="yellow"))
         server = PolicyServer(
             loaded.runner,
             clock=clock,
             api_key=os.environ.get(API_KEY_VARIABLE) or None,
-            report=console.print,
+            report=lambda line: messages.put(Text(line)),
         )
         try:
-            asyncio.run(_serve(config, server, console))
+            asyncio.run(_serve(config, server, messages))
         finally:
             server.close()
     return 0
 
 
-async def _serve(config: ServeConfig, server: PolicyServer, console: Console) -> None:
+async def _serve(config: ServeConfig, server: PolicyServer, messages: MessageQueue) -> None:
     for number in stop_signals():
         asyncio.get_running_loop().add_signal_handler(number, server.end)
     listener = await server.listen(config.host, config.port)
     url = f"ws://{spelled(config.host, config.port)}"
-    console.print(f"serving {config.policy.policy} at {url}; Ctrl-C ends it")
+    messages.put(Text(f"serving {config.policy.policy} at {url}; Ctrl-C ends it"))
     if not is_local(config.host):
         who = "every computer that reaches it"
         if os.environ.get(API_KEY_VARIABLE):
@@ -215,7 +218,7 @@ async def _serve(config: ServeConfig, server: PolicyServer, console: Console) ->
         else:
             who += f": set {API_KEY_VARIABLE} on both sides to keep strangers out"
         told = f"warning: {config.host} is open to {who}; nothing is encrypted"
-        console.print(told, style="yellow")
+        messages.put(Text(told, style="yellow"))
     try:
         await asyncio.wrap_future(server.ended)
     finally:

@@ -38,7 +38,7 @@ from mavbridge.flight.speed import require_speed
 from mavbridge.flight.state import observation_ages_ns
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
-from mavbridge.observe.output import flight_console
+from mavbridge.observe.output import patient_console
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 from policy.protocol import PolicyRunner
@@ -63,7 +63,7 @@ def fly(config: FlyConfig) -> int:
         MavbridgeError: the user, the vehicle or the policy made the flight impossible.
     """
     clock = MonotonicClock()
-    console = flight_console()
+    console = patient_console()
     # The policy is closed last, after the guard has ended: its close may hang or raise.
     with (
         empty_folders_removed(*output_folders(config)),

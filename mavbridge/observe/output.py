@@ -5,15 +5,19 @@ import io
 import os
 import select
 import sys
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO, cast
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.text import Text
 
 from mavbridge.core.provenance import printable
+from mavbridge.core.workers import HungError, Worker
 
 POLL_S = 0.05
 """Interval at which a stalled write checks whether it was given up."""
@@ -21,6 +25,8 @@ WRITE_BYTES = 512
 """Bytes handed to the kernel per write: a ready pipe takes them all (POSIX: _POSIX_PIPE_BUF)."""
 MAX_LINE = 2000
 """Kept characters of an unfinished line; longer text counts as a line."""
+MAX_MESSAGES = 100
+"""Capacity of a message queue. When it is full, the oldest messages are dropped and counted."""
 
 
 class PatientOutput(io.TextIOBase):
@@ -84,12 +90,40 @@ class SafeConsole(Console):
             yield part if part.control else part._replace(text=printable(part.text))
 
 
-def flight_console() -> Console:
-    """Return a console on standard error for ``FlightScreen``, its only user during a flight."""
+def patient_console(*, stderr: bool = True) -> Console:
+    """Return a console for one thread, the only one that a stalled reader holds up."""
     try:
-        return SafeConsole(file=cast(TextIO, PatientOutput(sys.stderr)), emoji=False)
-    except (OSError, AttributeError):  # standard error is closed, or replaced by a mere buffer
-        return SafeConsole(stderr=True, emoji=False)
+        stream = PatientOutput(sys.stderr if stderr else sys.stdout)
+        return SafeConsole(file=cast(TextIO, stream), emoji=False)
+    except (OSError, AttributeError):  # the stream is closed, or replaced by a mere buffer
+        return SafeConsole(stderr=stderr, emoji=False)
+
+
+class MessageQueue:
+    """Messages of any thread for a console; one thread prints them."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[RenderableType, bool]] = deque(maxlen=MAX_MESSAGES)
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        """Return the number of waiting messages."""
+        return len(self._waiting)
+
+    def put(self, message: RenderableType, *, soft_wrap: bool = True) -> None:
+        """Add a message; with ``soft_wrap`` the terminal wraps its lines."""
+        if len(self._waiting) == MAX_MESSAGES:
+            self._dropped += 1  # two threads at once can lose one count
+        self._waiting.append((message, soft_wrap))
+
+    def print_to(self, console: Console) -> None:
+        """Print and remove all messages."""
+        dropped, self._dropped = self._dropped, 0
+        if dropped:
+            console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
+        while self._waiting:
+            message, soft_wrap = self._waiting.popleft()
+            console.print(message, soft_wrap=soft_wrap)
 
 
 class _SurvivingText(io.TextIOWrapper):
@@ -170,3 +204,31 @@ def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
         sys.stdout, sys.stderr = old_out, old_err
         for lines in shown:
             lines.finish()
+
+
+@contextmanager
+def messages_shown(console: Console, timeout_s: float) -> Iterator[MessageQueue]:
+    """Context manager: print messages, and stray lines, on a thread of their own.
+
+    At the end the reader has ``timeout_s`` to take the rest.
+    """
+    messages = MessageQueue()
+
+    def show(stop: threading.Event) -> None:
+        while not stop.wait(POLL_S):
+            messages.print_to(console)
+        messages.print_to(console)
+
+    worker, output = Worker("mavbridge-terminal", show), console.file
+    worker.start()
+    try:
+        if isinstance(output, PatientOutput):
+            with stray_lines_shown(lambda line: messages.put(Text(line, style="dim"))):
+                yield messages
+        else:
+            yield messages
+    finally:
+        with suppress(HungError):
+            worker.join(timeout_s)
+        if isinstance(output, PatientOutput):
+            output.give_up()

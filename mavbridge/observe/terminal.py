@@ -5,7 +5,7 @@ import threading
 from collections import deque
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
@@ -16,7 +16,7 @@ from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
-from mavbridge.observe.output import PatientOutput, stray_lines_shown
+from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_shown
 from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
 
@@ -25,8 +25,6 @@ RATE_WINDOW_S = 1.0
 ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
 """Interval between lines if the output is not a terminal."""
-MAX_MESSAGES = 100
-"""Capacity of the message queue. When it is full, the oldest messages are dropped and counted."""
 
 
 class RateMeter:
@@ -65,7 +63,7 @@ class FlightScreen:
     def __init__(
         self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
     ) -> None:
-        """Show a flight on ``console``; a real flight uses that of ``flight_console``."""
+        """Show a flight on ``console``; a real flight uses a ``patient_console``."""
         self._console = console
         self._target_hz = (action_hz, vision_hz)
         self._readonly = readonly
@@ -75,9 +73,7 @@ class FlightScreen:
         self._missed_slots = 0
         self._activity_ns = 0
         self._stage: tuple[object, ...] = ()
-        self._messages: deque[tuple[RenderableType, bool]] = deque(maxlen=MAX_MESSAGES)
-        """Pending messages, and whether their lines are left to the terminal to wrap."""
-        self._dropped_messages = 0
+        self._messages = MessageQueue()
         self._refreshes = 0
         # Not Live's own redirection: any printing thread would wait for the console's lock.
         self._live = Live(
@@ -149,26 +145,21 @@ class FlightScreen:
     def show_message(self, text: str) -> None:
         """Log a message now, and show it with the next refresh."""
         _said.info("%s", text)
-        self._show(Text(without_secrets(text)), soft_wrap=True)
+        self._messages.put(Text(without_secrets(text)))
 
     def _show_stray(self, text: str) -> None:
         """Show a line printed elsewhere in the process; lines of the log are already logged."""
         if not is_log_thread():
             _said.info("%s", text)
-        self._show(Text(without_secrets(text), style="dim"), soft_wrap=True)
+        self._messages.put(Text(without_secrets(text), style="dim"))
 
     def show_report(self, report: TimingReport) -> None:
         """Show the table of measurements and the verdicts with the next refresh."""
         if (table := timing_table(report)) is not None:
-            self._show(table, soft_wrap=False)
+            self._messages.put(table, soft_wrap=False)
         for verdict in verdicts(report):
             _said.info("%s", verdict.plain if isinstance(verdict, Text) else verdict)
-            self._show(verdict, soft_wrap=not self._console.is_terminal)
-
-    def _show(self, what: RenderableType, *, soft_wrap: bool) -> None:
-        if len(self._messages) == MAX_MESSAGES:
-            self._dropped_messages += 1  # two threads at once can lose one count
-        self._messages.append((what, soft_wrap))
+            self._messages.put(verdict, soft_wrap=not self._console.is_terminal)
 
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
@@ -208,7 +199,7 @@ class FlightScreen:
         with self.live():
             while not stop.wait(1 / STATUS_HZ):
                 self.refresh()
-        self._print_messages()
+        self._messages.print_to(self._console)
 
     def live(self) -> AbstractContextManager[object]:
         """Context manager: show the status line if there is a terminal."""
@@ -219,7 +210,7 @@ class FlightScreen:
 
         During a flight only the screen's own thread calls this, at ``STATUS_HZ``.
         """
-        self._print_messages()
+        self._messages.print_to(self._console)
         line = self.status_line()
         self._refreshes += 1
         if self._console.is_terminal:
@@ -227,14 +218,6 @@ class FlightScreen:
             self._live.update(shown, refresh=True)
         elif self._refreshes % round(PLAIN_PERIOD_S * STATUS_HZ) == 0:
             self._console.print(line, soft_wrap=True)
-
-    def _print_messages(self) -> None:
-        dropped, self._dropped_messages = self._dropped_messages, 0
-        if dropped:
-            self._console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
-        while self._messages:
-            what, soft_wrap = self._messages.popleft()
-            self._console.print(what, soft_wrap=soft_wrap)
 
 
 def _age(now_ns: int, stamp_ns: int | None) -> str:

@@ -457,20 +457,24 @@ def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch)
             assert unpack(client.recv(PATIENT_S))
 
 
-def test_the_command_serves_until_it_is_told_to_stop() -> None:
+def test_the_command_serves_until_it_is_told_to_stop_whatever_its_terminal_does() -> None:
     port = free_port(socket.SOCK_STREAM)
     command = [sys.executable, "-m", "mavbridge", "serve", "--policy", "scripted:hover:velocity"]
     command += ["--port", str(port)]
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stdout is not None
+    shown, terminal = os.openpty()
+    with (
+        os.fdopen(shown, errors="replace") as lines,
+        subprocess.Popen(command, stdout=terminal, stderr=terminal) as process,
+    ):
+        os.close(terminal)
         ends = threading.Timer(PATIENT_S * 3, process.kill)
         ends.start()
         try:
-            lines = iter(process.stdout.readline, "")
             assert any(f"at ws://127.0.0.1:{port}" in line for line in lines)
-            contract = read_policy_contract(PolicyRequest(spec=f"ws://127.0.0.1:{port}"))
-            assert (contract.action, contract.arrays) == ("velocity", "numpy")
+            os.write(shown, b"\x13")  # Ctrl-S
+            for _ in range(2):
+                contract = read_policy_contract(PolicyRequest(spec=f"ws://127.0.0.1:{port}"))
+                assert (contract.action, contract.arrays) == ("velocity", "numpy")
             process.send_signal(signal.SIGINT)
             assert process.wait(PATIENT_S) == 0
         finally:

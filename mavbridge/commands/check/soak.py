@@ -31,7 +31,7 @@ from mavbridge.flight.app import fly_policy
 from mavbridge.flight.guard_process import start_guard
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.observe.output import flight_console
+from mavbridge.observe.output import patient_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
@@ -224,7 +224,9 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Fl
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
         meter = FlightMeter(plan, runner, clock=clock, guard_pid=guard.pid)
-        fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(meter,), guard=guard)
+        fly_policy(
+            plan, runner, clock=clock, console=patient_console(), sinks=(meter,), guard=guard
+        )
     if meter.release_reason is not None:
         raise PeerError(f"the policy lost the sticks: {meter.release_reason}")
     lasted_s, wanted_s = meter.report().duration_s, config.duration or 0.0

@@ -45,7 +45,7 @@ from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
-from mavbridge.observe.output import flight_console
+from mavbridge.observe.output import patient_console
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.meta import FlightMeta
@@ -72,7 +72,7 @@ def record(config: RecordConfig) -> int:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
     with ExitStack() as signals, ExitStack() as stack:  # signals: handled until all is closed
-        session = _Session(config, clock, flight_console(), stack)
+        session = _Session(config, clock, patient_console(), stack)
         session.run(signals.enter_context(stop_on_signals(is_bounded=True)))
     return 0
 
