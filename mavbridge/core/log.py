@@ -60,7 +60,7 @@ class _Queue(logging.handlers.QueueHandler):
 
 
 class _File(logging.FileHandler):
-    """File handler that raises OSError if it cannot write."""
+    """File handler that raises the error if it cannot write."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - of logging
         """Re-raise: the log's thread handles the error."""
@@ -93,7 +93,7 @@ def run_log(file: Path | None, *, verbose: bool) -> Iterator[None]:
     source, terminal = _Queue(), _Terminal(logging.DEBUG if verbose else logging.WARNING)
     sinks: list[logging.Handler] = [terminal]
     if file is not None:
-        sinks.append(_File(file, encoding="utf-8"))
+        sinks.append(_File(file, encoding="utf-8", errors="backslashreplace"))
         sinks[-1].setFormatter(logging.Formatter(_FORMAT))
     root, writer = logging.getLogger(), Worker(THREAD, lambda stop: _write(source, sinks, stop))
     levels = {name: logging.getLogger(name).level for name in OURS}
@@ -130,22 +130,27 @@ def _begin() -> None:
         _log.debug("git revision: %s", revision)
 
 
-def _write(source: _Queue, sinks: list[logging.Handler], stop: threading.Event) -> None:
-    """Pass each record to the handlers of its level; drop a file that cannot be written."""
+def _records(source: _Queue, stop: threading.Event) -> Iterator[logging.LogRecord]:
+    """Yield records until the stop, and at the end the number of those that were dropped."""
     while not (stop.is_set() and source.records.empty()):
-        try:
-            record = source.records.get(timeout=POLL_S)
-        except queue.Empty:
-            continue
+        with suppress(queue.Empty):
+            yield source.records.get(timeout=POLL_S)
+    if source.dropped:
+        text = f"{source.dropped} records were dropped"
+        yield logging.LogRecord(__name__, logging.WARNING, "", 0, text, None, None)
+
+
+def _write(source: _Queue, sinks: list[logging.Handler], stop: threading.Event) -> None:
+    """Pass each record to the handlers of its level; drop a handler that fails."""
+    for record in _records(source, stop):
         for sink in tuple(sinks):
             try:
                 if record.levelno >= sink.level:
                     sink.handle(record)
-            except OSError as error:
+            except Exception as error:  # noqa: BLE001 - the log never ends a command
                 sinks.remove(sink)
-                sys.stderr.write(f"the log ends here: {error}\n")
+                with suppress(Exception):  # standard error may be closed, too
+                    sys.stderr.write(f"the log ends here: {error}\n")
     for sink in sinks:
-        if source.dropped:
-            text = f"{source.dropped} records were dropped"
-            sink.handle(logging.LogRecord(__name__, logging.WARNING, "", 0, text, None, None))
-        sink.close()
+        with suppress(OSError):
+            sink.close()

@@ -1,6 +1,7 @@
 """The log of a run: what goes to the file, what to the terminal, and that nobody waits for it."""
 
 import logging
+import sys
 import threading
 from pathlib import Path
 
@@ -44,6 +45,18 @@ def test_runs_are_added_with_their_errors_and_the_traceback_of_a_bug(tmp_path: P
     assert "ERROR   mavbridge.said: no vehicle" in text
     assert "Traceback" in text
     assert "ZeroDivisionError: by zero" in text
+
+
+def test_neither_an_odd_name_nor_a_closed_terminal_ends_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    path = tmp_path / "run.log"
+    with run_log(path, verbose=True):
+        DETAIL.debug("no file caf\udcff")
+        speak()
+    assert r"no file caf\udcff" in path.read_text()
+    assert "trouble" in path.read_text()
 
 
 def test_what_does_not_fit_is_dropped_and_counted(
