@@ -168,13 +168,15 @@ class StreamedOutput:
         self._wait_until(was_put, on_wait)
 
     def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
-        """Wait for the condition, which itself waits briefly, as long as frames are finished."""
-        seen, since_ns = self.frames, self._clock.now_ns()
+        """Wait for the condition, which itself waits ``_POLL_S``, as long as frames are finished.
+
+        Waits are counted, not timed: a pause of the process (Ctrl-Z) is one of them.
+        """
+        seen, waits = self.frames, 0
         while not condition():
             on_wait()
-            if self.frames != seen:
-                seen, since_ns = self.frames, self._clock.now_ns()
-            elif self._clock.now_ns() - since_ns > STALL_S * NS_PER_S:
+            seen, waits = self.frames, waits + 1 if self.frames == seen else 0
+            if waits * _POLL_S > STALL_S:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:

@@ -33,6 +33,8 @@ Pressure = Literal["online", "offline"]
 START_S = 30.0
 STALL_S = 30.0
 """Longest silence of a writer that has work."""
+WAITS = 10
+"""Parts of each timeout: a pause of both processes (Ctrl-Z) uses up only one."""
 END_S = 5.0
 
 
@@ -169,7 +171,9 @@ class VideoWriter:
         """Receive until the condition holds; a writer silent for ``timeout_s`` counts as hung."""
         self._receive()
         while not condition():
-            if not wait([self._pipe, self._process.sentinel], timeout_s):
+            if not any(
+                wait([self._pipe, self._process.sentinel], timeout_s / WAITS) for _ in range(WAITS)
+            ):
                 self._failure = WriterDiedError(f"the writer process has hung for {timeout_s:g} s")
             self._receive()
             if self._process.exitcode is not None and not condition():

@@ -6,6 +6,7 @@ from contextlib import closing
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -56,6 +57,21 @@ def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["odd.mp4"]
     images = list(read_video(tmp_path / "odd.mp4"))
     assert [(rgb.shape, number_of(rgb)) for rgb in images] == [((48, 66, 3), k) for k in range(3)]
+
+
+def test_a_pause_of_both_processes_is_no_hang(tmp_path: Path) -> None:
+    wait, pauses = writer_module.wait, [[]]
+
+    def paused_once(*ends_and_timeout: Any) -> list[Any]:
+        return pauses.pop() if pauses else wait(*ends_and_timeout)
+
+    with (
+        patch.object(writer_module, "wait", paused_once),
+        writer(tmp_path, "offline") as video,
+    ):
+        video.submit(picture(0), make_row(0))
+        video.finish()
+    assert read_back(tmp_path) == ([0], [0])
 
 
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:

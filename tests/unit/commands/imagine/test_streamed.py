@@ -13,11 +13,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.fakes import FakeClock
 from helpers.recordings import count_frames, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
-from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import read_video
@@ -136,3 +137,23 @@ def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
         with pytest.raises(HungError, match="no frame"):
             put_all(made)
         go_on.set()
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_a_pause_of_the_process_is_no_hang(tmp_path: Path) -> None:
+    go_on, clock = threading.Event(), FakeClock()
+
+    class Waits(TinyWorld):
+        def decode(self, latents: Tensor) -> Tensor:
+            go_on.wait(DEADLINE_S)
+            return super().decode(latents)
+
+    def resume() -> None:
+        clock.advance_ns(1000 * NS_PER_S)
+        go_on.set()
+
+    with output(tmp_path / "a.mp4", Waits()) as made:
+        made._clock = clock
+        made.put(make_segment(0))
+        made.finish(resume)
+    require_whole(tmp_path / "a.mp4", 16)
