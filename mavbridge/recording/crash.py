@@ -25,24 +25,26 @@ _PILOTS = because(Code.PILOT_FLIES)
 class CrashWatch:
     """Crash detector. It takes the ticks of a flight in order; ``reason`` is the first crash.
 
-    If a hand disarms a vehicle that the policy no longer flies, the fall is its doing.
+    A fall counts if the policy had control when the vehicle was last armed, or in a pilot's
+    recording; a pilot who has taken over may disarm in the air.
     """
 
     def __init__(self) -> None:
         self.reason: str | None = None
         self._over_since_ns: int | None = None
-        self._was_armed = self._is_disarmed = False
+        self._was_armed = self._counts_falls = False
         self._disarmed_ns: int | None = None
 
     def see(self, tick: Tick) -> None:
         """Process one tick."""
-        fallen, is_pilots = self._fallen(tick), tick.release_reason == _PILOTS
-        counts_falls = is_pilots or tick.phase in (None, "flying", "leaving")
-        if self.reason is None and (counts_falls or not self._is_disarmed):
+        if tick.armed:  # the guard releases in the pass in which it sees a disarming
+            is_ours = tick.phase in (None, "flying", "leaving")
+            self._counts_falls = is_ours or tick.release_reason == _PILOTS
+        was_armed, fallen = self._was_armed, self._fallen(tick)
+        if self.reason is None and (self._counts_falls or was_armed or tick.armed):
             self.reason = self._said(tick) or self._overturned(tick)
-            if counts_falls:
+            if self._counts_falls:
                 self.reason = self.reason or fallen
-        self._is_disarmed = not counts_falls and not tick.armed
 
     def _said(self, tick: Tick) -> str | None:
         for text in map(recorded_text, tick.texts):

@@ -228,11 +228,12 @@ def test_a_fall_after_a_disarming_is_a_crash_of_our_own_flight_alone(
     phase: str, is_crash: bool
 ) -> None:
     falling = make_state(values=course_ticks(1)[0].state.values)  # type: ignore[union-attr]
-    after = [
-        make_tick(50 + k, phase=phase, armed=False, state=falling, position_ned_m=None)
-        for k in range(20)
-    ]
+    disarmed: dict[str, Any] = {"phase": "releasing", "armed": False, "state": falling}
+    why = because(Code.DISARMED)
+    after = [make_released_tick(51 + k, why, **disarmed) for k in range(20)]
     if not is_crash:
-        after.append(make_released_tick(71, "", phase=phase, texts=("vehicle: Crash: hit ground",)))
-    outcome = judged([*course_ticks(50, armed=True), *after], "duration")
+        disarmed["texts"] = ("vehicle: Crash: hit ground",)
+        after.append(make_released_tick(71, why, **disarmed))
+    flown = [*course_ticks(50), make_tick(50, phase=phase)]
+    outcome = judged([*flown, *after], "duration")
     assert (outcome.crash is not None) == is_crash

@@ -44,8 +44,10 @@ def test_the_vehicle_says_that_it_has_crashed(text: str, is_crash: bool) -> None
     assert (watched((0.01, {"texts": (text,)})) is not None) is is_crash
 
 
-OVER, FLYING = {"state": state(tilt_deg=180.0)}, {"state": state(speed_mps=0.1)}
-FALLING = {"state": state(speed_mps=3.0), "armed": False}
+OVER, FLYING = {"state": state(tilt_deg=180.0)}, {"state": state(speed_mps=0.1), "phase": "flying"}
+DISARMED = {"phase": "releasing", "release_reason": because(Code.DISARMED), "armed": False}
+FALLING = {"state": state(speed_mps=3.0)} | DISARMED
+SAID = {"texts": ("vehicle: Crash: Disarming: AngErr=70>30, Accel=1.0<3.0",)}
 TAKEN = {"phase": "released", "release_reason": because(Code.OPERATOR)}
 PILOTS = {"phase": "released", "release_reason": because(Code.PILOT_FLIES)}
 
@@ -56,14 +58,17 @@ PILOTS = {"phase": "released", "release_reason": because(Code.PILOT_FLIES)}
         pytest.param([(0.7, {"state": state(tilt_deg=95.0)})], "lay on its back", id="on its back"),
         pytest.param([(2.0, {"state": state(tilt_deg=85.0)})], None, id="leans"),
         pytest.param([(0.4, OVER), (0.1, FLYING), (0.4, OVER)], None, id="two flips"),
-        pytest.param([(2.0, OVER | {"armed": False})], None, id="carried home"),
+        pytest.param([(2.0, OVER | DISARMED)], None, id="carried home"),
         pytest.param([(1.0, FLYING), (0.5, FALLING)], "disarmed in the air", id="falls"),
         pytest.param(
-            [(1.0, FLYING), (2.0, {"state": state(speed_mps=0.2), "armed": False}), (0.5, FALLING)],
+            [(1.0, FLYING), (2.0, {"state": state(speed_mps=0.2)} | DISARMED), (0.5, FALLING)],
             None,
             id="lands and is carried",
         ),
-        pytest.param([(0.5, FALLING)], None, id="never armed"),
+        pytest.param([(0.5, FALLING), (0.1, SAID | DISARMED)], None, id="never armed"),
+        pytest.param(
+            [(1.0, FLYING), (0.1, DISARMED), (0.1, SAID | DISARMED)], "said", id="told late"
+        ),
         pytest.param([(1.0, FLYING | TAKEN), (0.5, FALLING | TAKEN)], None, id="by a hand"),
         pytest.param(
             [(1.0, FLYING | PILOTS), (0.5, FALLING | PILOTS)], "disarmed in", id="a pilot's flight"
