@@ -348,10 +348,10 @@ function addVideo(parent, video, timeline) {
   timeline.listeners.push(() => {
     if (timeline.cursor === null || !player.paused) return;
     const image = Math.max(lastAtOrBefore(exposed, timeline.cursor), 0);
-    player.currentTime = (image + 0.5) / video.rate_hz;
+    player.currentTime = exposed[image] - exposed[0] + 0.001;
   });
   player.addEventListener("timeupdate", () => {
-    const image = Math.min(Math.floor(player.currentTime * video.rate_hz), exposed.length - 1);
+    const image = lastAtOrBefore(exposed, exposed[0] + player.currentTime);
     if (!player.paused && image >= 0) timeline.look(exposed[image]);
   });
 }

@@ -191,5 +191,4 @@ def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
     return {
         "source": f"data:video/mp4;base64,{data}",
         "exposed_s": _packed(images.exposed_s),
-        "rate_hz": flight.meta.visual_hz,
     }

@@ -65,6 +65,7 @@ def test_the_page_holds_the_flight_and_needs_nothing_else(tmp_path: Path) -> Non
     assert unpacked(shown["track"]["north"])[10] == pytest.approx(1.0)
     video = base64.b64decode(shown["video"]["source"].partition(",")[2])
     assert video == (tmp_path / "flight/camera.mp4").read_bytes()
+    assert list(shown["video"]) == ["source", "exposed_s"]  # sought by stamps, not by a rate
 
 
 def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
