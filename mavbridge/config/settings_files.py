@@ -57,7 +57,7 @@ def _leaves(value: Any, keys: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
     elif isinstance(value, list):
         for each in value:
             yield from _leaves(each, keys)
-    elif isinstance(value, str | int | float):
+    elif isinstance(value, str | int | float) and value is not False:
         yield keys, str(value)
 
 

@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 
 from helpers.status import asked_flight, status_of, told_by
+from mavbridge.cli import cli
 from mavbridge.config.flight import FlyConfig
+from mavbridge.config.settings_files import untrusted_settings
+from policy.files import read_toml
 
 VEHICLE = ("--connect", "udp:127.0.0.1:1")
 
@@ -25,6 +28,16 @@ def test_the_printed_file_holds_the_defaults_of_every_setting(
         assert f"\n[{section}]\n" in printed
     for line in ("slew = 8.0", "# attitude_age =", "realtime = true", "# Largest tilt, in degrees"):
         assert f"\n{line}" in printed
+
+
+@pytest.mark.parametrize("command", [name for name in cli if not name.startswith("-")])
+def test_the_printed_file_may_be_read_by_its_command(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert status_of(command, "--print-config") == 0
+    path = tmp_path / "all.toml"
+    path.write_text(capsys.readouterr().out)
+    assert list(untrusted_settings(read_toml(path), [])) == []
 
 
 def test_a_section_whose_keys_are_all_commented_out_asks_for_nothing(tmp_path: Path) -> None:
