@@ -20,10 +20,12 @@ _DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx
 _ADDRESS_KEYS = ("rerun", "host", "ray")
 _OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
 _LOCAL = re.compile(
-    r"(?:$|off$|spawn$|/|serial:|udp://:|[\w./-]+\.rrd$"
+    r"(?:$|/|serial:|udp://:"
     r"|(?:connect=)?(?:[\w+]+:)?(?://)?(?:127\.0\.0\.1|localhost|\[?::1\]?)(?::\d+)?(?:[/?]|$))"
 )
 """Matches addresses on this computer."""
+_VIEWER = re.compile(r"(?:off|spawn|connect|[\w./-]+\.rrd)$")
+"""Matches forms of ``--rerun`` without an address; plain ``connect`` is this computer's viewer."""
 
 
 def foreign_policy(spec: str) -> str | None:
@@ -66,7 +68,8 @@ def _foreign(key: str, value: str) -> str | None:
         return foreign_policy(value)
     if key == "camera":
         return "a program" if split_camera(value)[1].startswith("pipe:") else None
-    if key in _ADDRESS_KEYS and (not _LOCAL.match(value) or (key == "host" and not value)):
+    is_local = _LOCAL.match(value) or (key == "rerun" and _VIEWER.match(value))
+    if key in _ADDRESS_KEYS and (not is_local or (key == "host" and not value)):
         return "another computer, or a port that is open to others"
     if key in _OUTPUT_KEYS and (value.startswith(("/", "~")) or ".." in Path(value).parts):
         return "a place outside the working directory to write to"

@@ -164,6 +164,10 @@ REFUSED = [
     ('json = "~/.profile"', "--json"),
     ('report = "~root/x"', "--report"),
     ("host = 0", "--host"),
+    ('host = "connect"', "--host"),
+    ('ray = "spawn"', "--ray"),
+    ("ray = true", "--ray"),
+    ('rerun = "connect=spawn"', "--rerun"),
     ('rerun = "/tmp/x.rrd"', "--rerun"),
 ]
 TAKEN = """
@@ -176,6 +180,11 @@ report = "report.json"
 rerun = "flight.rrd"
 set = ["RC_OVERRIDE_TIME=0.5"]
 """
+
+
+@pytest.mark.parametrize("target", ["off", "spawn", "connect", "flights/today.rrd"])
+def test_a_settings_file_may_name_a_viewer_on_this_computer(target: str) -> None:
+    assert list(untrusted_settings({"rerun": target}, [])) == []
 
 
 @pytest.mark.parametrize(("text", "flag"), REFUSED)
