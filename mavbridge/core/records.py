@@ -126,9 +126,8 @@ class Tick:
 
     @property
     def is_refused(self) -> bool:
-        """True if an action was due, but the link did not take it."""
-        is_due = self.trace is not None or self.phase in ("leaving", "holding")
-        return is_due and self.sent is None and not self.readonly
+        """True if the link did not take the policy's action."""
+        return self.trace is not None and self.sent is None and not self.readonly
 
     @property
     def activity(self) -> str:

@@ -54,14 +54,17 @@ def numpy_runner() -> Iterator[PolicyRunner]:
         yield loaded.runner
 
 
-def test_an_action_that_was_refused_in_flight_is_refused_in_the_replay() -> None:
+@pytest.mark.parametrize(("phase", "is_flown"), [("flying", True), ("leaving", False)])
+def test_an_action_that_was_refused_in_flight_is_refused_in_the_replay(
+    phase: str, *, is_flown: bool
+) -> None:
     source = golden("numpy_px4")
-    at = [k for k, tick in enumerate(source.ticks) if tick.trace is not None][150]
+    at = [k for k, tick in enumerate(source.ticks) if tick.phase == phase and tick.sent][2]
     refused = replace(source.ticks[at], sent=None)
     ticks = (*source.ticks[:at], refused, *source.ticks[at + 1 :])
     replayed = replay_guard(replace(source, ticks=ticks))[at].replayed
     assert replayed is not None
-    assert (replayed.trace is not None, replayed.sent) == (True, None)
+    assert (replayed.trace is not None, replayed.sent) == (is_flown, None)
 
 
 def repeated(source: ReplaySource, runner: PolicyRunner) -> PolicyComparison:

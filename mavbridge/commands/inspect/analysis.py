@@ -31,7 +31,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Solve, Tick
-from mavbridge.core.vehicle import Percentiles
+from mavbridge.core.vehicle import Percentiles, Sticks
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
@@ -65,10 +65,12 @@ class HolderSpan:
     """Why the policy did not fly, for most of the span; None while it flew."""
 
 
-def _holder(tick: Tick) -> Holder:
+def _holder(tick: Tick, *, is_stick_flight: bool) -> Holder:
     if tick.trace is not None:
         return "read-only" if tick.readonly else "policy"
-    if tick.sent is not None or tick.is_refused:
+    # Neutral sticks are due in each pass; setpoints end on PX4 before the phase does.
+    is_refused = is_stick_flight and tick.phase in ("leaving", "holding")
+    if tick.sent is not None or is_refused:
         return "idle" if tick.phase == "preparing" else "neutral"
     return "release" if tick.phase == "releasing" else "pilot"
 
@@ -78,7 +80,11 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
     does not start a new stretch."""
     spans: list[HolderSpan] = []
     ends_ns = [tick.woke_ns for tick in ticks[1:]] + [tick.woke_ns for tick in ticks[-1:]]
-    for holder, group in groupby(zip(ticks, ends_ns, strict=True), lambda pair: _holder(pair[0])):
+    is_stick_flight = any(isinstance(tick.sent, Sticks) for tick in ticks)
+    for holder, group in groupby(
+        zip(ticks, ends_ns, strict=True),
+        lambda pair: _holder(pair[0], is_stick_flight=is_stick_flight),
+    ):
         span = list(group)
         lasted_ns: Counter[object] = Counter()
         reasons: dict[object, Reason | None] = {}

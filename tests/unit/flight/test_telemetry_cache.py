@@ -156,7 +156,7 @@ def test_history_follows_what_was_sent() -> None:
     viewed.receive(TICK._replace(sent=None))  # refused by the link: the vehicle flies on
     at_ns = TICK.sent_ns + 20 * MS
     assert viewed.view.history.resample(at_ns).tolist() == [[pytest.approx(STICKS)] * 2]
-    viewed.receive(NOBODY._replace(sent_ns=at_ns))
+    viewed.receive(NOBODY._replace(sent_ns=at_ns, phase=Phase.LEAVING))  # no setpoint was due
     assert viewed.view.history.resample(at_ns + 10 * MS)[0, 1].tolist() == [0.0] * 4
 
 

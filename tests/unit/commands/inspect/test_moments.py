@@ -11,7 +11,7 @@ from mavbridge.commands.inspect.moments import Arrivals, find_delays
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
-from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.core.vehicle import NEUTRAL, Velocity
 
 
 def flown(count: int) -> list[Tick]:
@@ -123,6 +123,9 @@ def test_who_held_the_sticks_when() -> None:
     assert [span.reason for span in spans[2:4]] == [None, old]
     (looking_on,) = holder_spans([make_tick(0, sent=None, readonly=True)], START_NS)
     assert looking_on.holder == "read-only"
+    setpoint = Velocity(1.0, 0.0, 0.0, 0.0)
+    setpoints = [make_tick(0, sent=setpoint), make_released_tick(1, old, phase="leaving")]
+    assert [span.holder for span in holder_spans(setpoints, START_NS)] == ["policy", "pilot"]
 
 
 def test_of_several_reasons_the_one_that_lasted_is_told() -> None:
