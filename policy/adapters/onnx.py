@@ -226,6 +226,9 @@ class GraphFile:
             shapes[port] = [] if scalar else list(wanted[role])
             declared = port.get_partial_shape()
             sizes = list(declared) if declared.rank.is_static else []
+            is_reshaped = role != "image" and 0 < len(sizes) != len(shapes[port])
+            if is_reshaped and math.prod(_sizes(port)[1:]) == math.prod(shapes[port][1:]):
+                continue  # the same numbers, flat or with more axes; reshape fails on others
             axes = zip(reversed(sizes), reversed(shapes[port][1:]), strict=False)  # no batch
             if any(axis.is_static and axis.get_length() != size for axis, size in axes):
                 raise CheckpointError(
@@ -269,8 +272,7 @@ class OnnxGraphs:
 
     def __init__(self, files: OnnxFiles, seed: int) -> None:
         wanted, description = _wanted(files), files.description
-        self.files = files
-        self.seed = seed
+        self.files, self.seed = files, seed
         self._encoder: GraphFile | None = None
         contract = replace(description.interface.contract, arrays="numpy")
         seen = "image"
@@ -350,11 +352,9 @@ class OnnxGraphs:
         def runner_of(vision: Precision, action: Precision) -> PolicyRunner:
             is_given = vision == action == "f32"
             policy, reset = in_float32 if is_given else self.at(vision, action)
+            name = engine_name(vision, action)
             runner = make_runner(
-                *(policy, run, run),
-                engine=engine_name(vision, action),
-                settings=settings,
-                compile_end=run,
+                *(policy, run, run), engine=name, settings=settings, compile_end=run
             )
             return replace(runner, reset=reset) if self._rest.hidden else runner
 

@@ -39,8 +39,8 @@ class Head(nn.Module):
     def forward(self, feature: Tensor, state: Tensor, history: Tensor, *more: Tensor) -> Tensor:
         if state.shape[1] != DUAL.state_dim:
             raise ValueError("a check of a shape is no decision by values")
-        parts = [feature, state * 0.1, history.flatten(1), *(part.flatten(1) for part in more)]
-        chunk: Tensor = self.layers(torch.cat(parts, dim=1)).tanh()
+        flat = [part.flatten(1) for part in (feature, history, *more)]
+        chunk: Tensor = self.layers(torch.cat([*flat, state * 0.1], dim=1)).tanh()
         return chunk.reshape(-1, DUAL.horizon, 4)
 
 

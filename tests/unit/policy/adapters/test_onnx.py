@@ -82,10 +82,11 @@ def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
     require_same(loaded.runner, load("helpers.torch_policies:ForwardOnly", dual_rate=False).runner)
 
 
-def test_an_encoder_and_a_head(tmp_path: Path) -> None:
+@pytest.mark.parametrize("axes", [(), (1, 1)])
+def test_an_encoder_and_a_head(tmp_path: Path, axes: tuple[int, ...]) -> None:
     policy = TwoRates()
     write(policy.visual_encoder, tmp_path / "encoder.onnx", {"x": IMAGE})
-    shapes = {"feature": (1, DUAL.feature_dim), "state": STATE, "history": (1, 4, 4)}
+    shapes = {"feature": (1, DUAL.feature_dim, *axes), "state": STATE, "history": (1, 4, 4)}
     write(policy.head, tmp_path / "head.onnx", shapes)
     description = {"contract": json.loads(SINGLE.to_json()), "inputs": {"image": "x"}}
     (tmp_path / "policy.json").write_text(json.dumps(description))
