@@ -221,13 +221,13 @@ def onnx_files(source: Path) -> list[Path]:
 def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
     """Draft from graphs: names and sizes of image, state, history and chunk."""
     inputs, outputs = _ports(graphs)
+    given = [port.shape for port in outputs]  # an input shaped like an output is a hidden state
     planes = [port for port in inputs if len(port.shape) >= 4]
     images = [port for port in planes if port.shape[-3] in (1, 3)]
     for port in planes:
-        if port not in images and port.shape[-1] in (1, 3):
+        if not images and port.shape not in given and port.shape[-1] in (1, 3):
             raise CheckpointError(f"{port.where} has its channels last: export it as [1, C, H, W]")
     histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]
-    given = [port.shape for port in outputs]  # an input shaped like an output is a hidden state
     others = [
         port
         for port in inputs

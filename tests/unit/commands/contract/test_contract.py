@@ -198,6 +198,7 @@ def graph(path: Path, height: int | str = 96, *, channels_last: bool = False) ->
         "rgb_front": [1, height, 128, 3] if channels_last else [1, 3, height, 128],
         "robot_state": [1, 2],
         "action_history": [1, 4, 4],
+        "feature": [1, 8, 1, 1],
     }
     inputs = [helper.make_tensor_value_info(name, float32, s) for name, s in shapes.items()]
     chunk = helper.make_tensor("value", float32, [1, 8, 4], [0.0] * 32)
