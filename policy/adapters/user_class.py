@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from types import MethodType, ModuleType
+from types import ModuleType
 
 from policy.adapters.description import Description
 from policy.adapters.interface import Interface
@@ -173,8 +173,9 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
         policy: object = found(**arguments)
         has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
         if has_pair and getattr(policy, "predict", None) is None:
-            # Of object: a frozen dataclass has no setattr.
-            object.__setattr__(policy, "predict", MethodType(predict_by_pair, policy))
+            # A subclass, since a class may be frozen or have slots.
+            members = {"predict": predict_by_pair, "__module__": found.__module__, "__slots__": ()}
+            object.__setattr__(policy, "__class__", type(found.__name__, (found,), members))
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch

@@ -204,6 +204,7 @@ class PredictIsNone(NoPredict):
 
 
 class FastPair:
+    __slots__ = ()  # no instance takes another attribute
     contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=1)
 
     def encode_visual(self, image):
