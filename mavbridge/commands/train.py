@@ -54,7 +54,8 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
     flown = common_contract(flights)
     if (action := flown.action) != "sticks":
         raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
-    config = replace(config, contract=Contract(state_frame=flown.state_frame))
+    terms = {name: getattr(flown, name) for name in STICK_TERMS}
+    config = replace(config, contract=Contract(state_frame=flown.state_frame, **terms))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
 
 

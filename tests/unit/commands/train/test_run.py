@@ -51,13 +51,15 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(tmp_path: Path) -> None:
     assert runner.act(feature, state, history).shape == (1, 16, 4)
 
 
-def test_a_world_model_is_trained(tmp_path: Path) -> None:
+def test_a_world_model_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = Contract(full_lean_deg=45.0)
+    monkeypatch.setattr(run, "common_contract", lambda flights: flown)
     flags = ("--image-size", "32", "--steps", "2")
     out, text = trained(tmp_path, "train-world-model", *flags, seconds=2.0)
     assert "imagined to" in text
     model = load_world_model(out)
     assert model.config.image_size == 32
-    assert model.config.contract.state_frame == "ned_frd"
+    assert model.config.contract == flown
 
 
 def test_the_end_is_not_learned_from_flights_without_gates(
