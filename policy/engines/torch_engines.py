@@ -5,12 +5,13 @@ And what a user's policy holds: its modules, and the attributes that change from
 
 import copy
 import hashlib
+import re
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from io import IOBase
-from itertools import islice
+from itertools import count, islice
 from types import SimpleNamespace
 
 import numpy as np
@@ -131,8 +132,8 @@ def snapshot(policy: object) -> dict[str, object]:
     """Return the attributes of a policy and of all that it holds, by name, in a comparable form.
 
     Tensors are compared by value, except the weights, which no forward call changes; numpy arrays,
-    numbers and texts by value; collections by the identity of their elements; iterators never
-    compare equal; other objects by identity.
+    numbers and texts by value; collections by the identity of their elements; iterators but
+    counters never compare equal; other objects by identity.
     """
     held = [(path, _attributes(holder)) for path, holder in _held_by(policy)]
     return {path + name: _mark(value) for path, inside in held for name, value in inside.items()}
@@ -172,7 +173,7 @@ def _attributes(holder: object) -> dict[str, object]:
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
     """Return the names, without the path, of attributes that were added, removed or changed."""
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return sorted({name.rpartition(".")[2].partition("[")[0] for name in names})
+    return sorted({re.sub(r"\[.*?\]", "", name).rpartition(".")[2] for name in names})
 
 
 def _mark(value: object) -> object:
@@ -181,11 +182,11 @@ def _mark(value: object) -> object:
         digest = hashlib.sha256(array.float().numpy().tobytes()).digest()
         return str(array.dtype), tuple(array.shape), digest
     if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, value.tobytes()
+        return value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).digest()
     if value is None or isinstance(value, bool | int | str | bytes):
         return value
-    if isinstance(value, float):
-        return repr(value)  # NaN equals itself
+    if isinstance(value, float | count):
+        return repr(value)  # NaN equals itself; a counter tells its next number
     if isinstance(value, dict):
         return tuple((id(key), id(element)) for key, element in value.items())
     if isinstance(value, list | tuple | set | frozenset | deque):
