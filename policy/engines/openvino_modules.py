@@ -151,11 +151,14 @@ def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgra
         if "data-dependent" in first:
             raise PolicyError(_DECIDES) from error
         raise PolicyError(f"torch.export: {type(error).__name__}: {first}") from error
-    given = program.graph_signature.user_inputs
-    for node in program.graph.find_nodes(op="call_function", target=torch.ops.aten.item.default):
-        read = node.all_input_nodes[0]
-        if read.op != "placeholder" or read.name in given:  # the number of a weight is constant
-            raise PolicyError(_DECIDES)
+    varying, is_written = set(program.graph_signature.user_inputs), False
+    for node in program.graph.nodes:  # in order of execution
+        if is_written or any(read.name in varying for read in node.all_input_nodes):
+            varying.add(node.name)
+            if node.target is torch.ops.aten.item.default:
+                raise PolicyError(_DECIDES)
+            # Written in place, any tensor may vary: views of one share its memory.
+            is_written |= getattr(getattr(node.target, "_schema", None), "is_mutable", False)
     return program
 
 
@@ -203,7 +206,7 @@ class _Undecided(TorchFunctionMode):
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        is_list = func is torch.as_tensor and isinstance(args[0], list)
+        is_list = func is torch.as_tensor and isinstance(next(iter(args), None), list)
         copied = tree_leaves((args, kwargs)) if is_list or func is torch.tensor else []
         if any(isinstance(each, Tensor) for each in copied) or func.__name__ in _READS:
             raise PolicyError(_DECIDES)

@@ -144,6 +144,26 @@ class Reading(TwoRates):
         return chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1)
 
 
+class ReadingWritten(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        height = torch.zeros(1)
+        height[0] = state[0, 2]
+        return super().predict_fast(feature, state, history, steps) * (100 - height[0].item())
+
+
+class ReadingConstants(TwoRates):
+    """Reads a table that it holds, and counts its instances in the class."""
+
+    ids = itertools.count()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.id, self.gains = next(self.ids), torch.linspace(0.5, 1, 4)
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return super().predict_fast(feature, state, history, steps) * self.gains[1].item()
+
+
 class Scripted(TwoRates):
     """Python around an encoder in TorchScript."""
 

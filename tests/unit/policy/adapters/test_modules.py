@@ -41,6 +41,7 @@ horizon = 8
         ("Scripted", True),
         ("Listed", True),
         ("ModuleAsMethod", False),
+        ("ReadingConstants", True),
         ("Stepwise", True),
         ("Stepwise", False),
     ],

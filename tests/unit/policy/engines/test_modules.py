@@ -49,6 +49,7 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("Resetting", "the policy has reset"),
         ("Deciding", "it decides by the values of a tensor"),
         ("Reading", "it decides by the values of a tensor"),
+        ("ReadingWritten", "it decides by the values of a tensor"),
         ("ScriptedDeciding", "it decides by the values of a tensor"),
         ("Looping", "its graph has 1.. operations, and at most 90"),
     ],
