@@ -1,6 +1,6 @@
 """Settings of the commands that fly simulated episodes, and the seeds of their courses."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -148,10 +148,19 @@ class DemonstrateConfig(Ranged):
         """Raise UserError if the expert could not fly so."""
         super().__post_init__()
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
-        if self.policy.checkpoint is None and self.policy.policy != PolicyConfig.policy:
-            raise UserError(f"--policy {self.policy.policy} is the student: give its --checkpoint")
-        if self.solve_time > 0 and self.policy.checkpoint is None:
-            raise UserError("--solve-time is the student's: give its --checkpoint")
+        if self.policy.dual_rate is False:
+            raise UserError("demonstrations are flown at two rates: leave out --single-rate")
+        students = {"solve time": self.solve_time != 0.0}
+        for each in fields(PolicyConfig):
+            if each.name not in ("seed", "image_size", "dual_rate"):  # the expert's too
+                is_given = getattr(self.policy, each.name) != each.default
+                students[each.name.replace("_", " ")] = is_given
+        if self.policy.checkpoint is None and any(students.values()):
+            given = ", ".join(name for name, is_given in students.items() if is_given)
+            raise UserError(
+                f"{given}: the expert has none; give the student's --checkpoint, or leave it out "
+                "(the expert flies by rates with --action rates)"
+            )
         check_range("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")
 
     @property
