@@ -50,11 +50,13 @@ def test_runs_are_added_with_their_errors_and_the_traceback_of_a_bug(tmp_path: P
 def test_neither_an_odd_name_nor_a_closed_terminal_ends_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "stderr", None)
     path = tmp_path / "run.log"
-    with run_log(path, verbose=True):
-        DETAIL.debug("no file caf\udcff")
-        speak()
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", None)
+        patch.setattr(logging.getLogger(), "handlers", [])  # pytest-xdist cannot send the name
+        with run_log(path, verbose=True):
+            DETAIL.debug("no file caf\udcff")
+            speak()
     assert r"no file caf\udcff" in path.read_text()
     assert "trouble" in path.read_text()
 
