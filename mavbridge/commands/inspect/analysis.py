@@ -68,9 +68,7 @@ class HolderSpan:
 def _holder(tick: Tick, *, is_stick_flight: bool) -> Holder:
     if tick.trace is not None:
         return "read-only" if tick.readonly else "policy"
-    # Neutral sticks are due in each pass; setpoints end on PX4 before the phase does.
-    is_refused = is_stick_flight and tick.phase in ("leaving", "holding")
-    if tick.sent is not None or is_refused:
+    if tick.sent is not None or tick.lacks_neutral(is_stick_flight=is_stick_flight):
         return "idle" if tick.phase == "preparing" else "neutral"
     return "release" if tick.phase == "releasing" else "pilot"
 

@@ -73,16 +73,15 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     loop = GuardLoop(clock, link, port)
     settings = recorded_plan(source).guard
     port.inbox.append(encode_to_guard(settings))
-    # Neutral sticks are due in each pass; setpoints end on PX4 before the phase does.
-    resting = ("leaving", "holding") if settings.meaning.kind == "sticks" else ()
+    is_stick_flight = settings.meaning.kind == "sticks"
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
     for tick, chunk, act, stop in _arrivals(source):
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
-        is_rest_refused = tick.phase in resting and tick.sent is None
-        transport.is_refusing = tick.is_refused or is_rest_refused
+        lacks_neutral = tick.lacks_neutral(is_stick_flight=is_stick_flight)
+        transport.is_refusing = tick.is_refused or lacks_neutral
         messages: tuple[Chunk | OperatorCommand | EndRequest | None, ...] = (chunk, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
