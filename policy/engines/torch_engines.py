@@ -123,7 +123,7 @@ class _Graph:
 
 def modules_of(policy: object) -> list[nn.Module]:
     """Return the modules that a policy is or holds, except those inside another module."""
-    modules = [held for _, held in _held_by(policy) if isinstance(held, nn.Module)]
+    modules = [held for _, held, _ in _held_by(policy) if isinstance(held, nn.Module)]
     inner = {id(child) for module in modules for child in module.modules() if child is not module}
     return [module for module in modules if id(module) not in inner]
 
@@ -135,19 +135,22 @@ def snapshot(policy: object) -> dict[str, object]:
     numbers and texts by value; collections by the identity of their elements; iterators but
     counters never compare equal; other objects by identity.
     """
-    held = [(path, _attributes(holder)) for path, holder in _held_by(policy)]
-    return {path + name: _mark(value) for path, inside in held for name, value in inside.items()}
+    return {
+        path + name: _mark(value)
+        for path, _, inside in _held_by(policy)
+        for name, value in inside.items()
+    }
 
 
-def _held_by(policy: object) -> list[tuple[str, object]]:
-    """Return the policy and, with their paths, the modules, collections and objects below it."""
-    held, seen = [("", policy)], {id(policy)}
-    for path, holder in held:  # grows
-        for name, value in _attributes(holder).items():
+def _held_by(policy: object) -> list[tuple[str, object, dict[str, object]]]:
+    """Return the policy and the modules, collections and objects below it: path, it, attributes."""
+    held, seen = [("", policy, _attributes(policy))], {id(policy)}
+    for path, _, inside in held:  # grows
+        for name, value in inside.items():
             is_open = isinstance(value, _OPENED) or _is_of_user(type(value))
             if is_open and id(value) not in seen and len(held) < MAX_HELD:
                 seen.add(id(value))
-                held.append((path + name, value))
+                held.append((path + name, value, _attributes(value)))
     return held
 
 
