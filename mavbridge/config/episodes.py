@@ -28,6 +28,8 @@ HELD_OUT_COURSE_SEED = 1_000_000
 """First seed of the evaluation's courses; nothing is ever trained on them."""
 
 MAX_EPISODES = 10_000
+_EXPERTS = ("seed", "image_size", "dual_rate")
+"""Settings of a policy that a demonstration uses without a student, or checks itself."""
 """Most episodes per evaluation, so that different seeds never share courses."""
 
 MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
@@ -150,15 +152,13 @@ class DemonstrateConfig(Ranged):
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         if self.policy.dual_rate is False:
             raise UserError("demonstrations are flown at two rates: leave out --single-rate")
-        students = {"solve time": self.solve_time != 0.0}
-        for each in fields(PolicyConfig):
-            if each.name not in ("seed", "image_size", "dual_rate"):  # the expert's too
-                is_given = getattr(self.policy, each.name) != each.default
-                students[each.name.replace("_", " ")] = is_given
-        if self.policy.checkpoint is None and any(students.values()):
-            given = ", ".join(name for name, is_given in students.items() if is_given)
+        students = [each for each in fields(PolicyConfig) if each.name not in _EXPERTS]
+        given = [each.name for each in students if getattr(self.policy, each.name) != each.default]
+        given += ["solve_time"] if self.solve_time else []
+        if self.policy.checkpoint is None and given:
+            names = ", ".join(given).replace("_", " ")
             raise UserError(
-                f"{given}: the expert has none; give the student's --checkpoint, or leave it out "
+                f"{names}: the expert has none; give the student's --checkpoint, or leave it out "
                 "(the expert flies by rates with --action rates)"
             )
         check_range("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")

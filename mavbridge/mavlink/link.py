@@ -216,7 +216,8 @@ class MavlinkLink:
             case Timesync() as reply:
                 self._timesync.receive(reply, arrived_ns)
             case CommandAck() as ack:
-                if is_for_us := ack.target in ((0, 0), self._codec.source):
+                is_for_us = ack.target in ((0, 0), self._codec.source)
+                if is_for_us:
                     self.commands.receive(ack)
         if is_for_us:
             before = vehicle.params.interruption

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TextIO, cast
 
@@ -221,11 +221,9 @@ def messages_shown(console: Console, timeout_s: float) -> Iterator[MessageQueue]
 
     worker, output = Worker("mavbridge-terminal", show), console.file
     worker.start()
+    stray = stray_lines_shown(lambda line: messages.put(Text(line, style="dim")))
     try:
-        if isinstance(output, PatientOutput):
-            with stray_lines_shown(lambda line: messages.put(Text(line, style="dim"))):
-                yield messages
-        else:
+        with stray if isinstance(output, PatientOutput) else nullcontext():
             yield messages
     finally:
         with suppress(HungError):

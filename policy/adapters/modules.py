@@ -257,9 +257,8 @@ class _Call:
         """Prepare the calls, with arguments of these roles.
 
         ``outputs[result]`` of the description selects the result among several values, and its
-        ``inputs`` name arguments. An argument with a number or
-        text as its default is a setting and keeps it, with all after it, unless it is named as a
-        role.
+        ``inputs`` name arguments. An argument with a number or text as its default is a setting
+        and keeps it, with all after it, unless it is named as a role.
         """
         self._name, self._function, self._roles = name, function, roles
         self._result, self._pick = result, description.outputs.get(result)

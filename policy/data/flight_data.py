@@ -59,8 +59,8 @@ class FlightData:
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
     contract: Contract
-    """Contract by which it was flown; of a dataset, the state's frame and
-    ``STICK_TERMS``, by default those of ``Contract``."""
+    """Contract by which it was flown; of a dataset, the state's frame and ``STICK_TERMS``, by
+    default those of ``Contract``."""
     course_seed: int | None = None
     """Seed of the simulated course; its flights are held out together. None: unknown."""
     damage: tuple[str, ...] = ()
