@@ -10,6 +10,7 @@ its configuration and weights.
 import contextlib
 import hashlib
 import logging
+import operator
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ from typing import Any
 
 import openvino as ov
 import torch
-from torch import Tensor, nn
+from torch import Tensor, fx, nn
 from torch.export import ExportedProgram
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
@@ -151,15 +152,25 @@ def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgra
         if "data-dependent" in first:
             raise PolicyError(_DECIDES) from error
         raise PolicyError(f"torch.export: {type(error).__name__}: {first}") from error
-    varying, is_written = set(program.graph_signature.user_inputs), False
+    varying, owners = set(program.graph_signature.user_inputs), dict[str, str]()
     for node in program.graph.nodes:  # in order of execution
-        if is_written or any(read.name in varying for read in node.all_input_nodes):
-            varying.add(node.name)
+        owners[node.name] = owner = owners.get(_shared(node), node.name)
+        if any(owners[read.name] in varying for read in node.all_input_nodes):
+            varying.add(owner)
             if node.target is torch.ops.aten.item.default:
                 raise PolicyError(_DECIDES)
-            # Written in place, any tensor may vary: views of one share its memory.
-            is_written |= getattr(getattr(node.target, "_schema", None), "is_mutable", False)
     return program
+
+
+def _shared(node: fx.Node) -> str:
+    """Return the name of the node that this one views or writes in place; empty if none."""
+    if node.target is operator.getitem:  # of several views
+        return node.all_input_nodes[0].name
+    schema = getattr(node.target, "_schema", None)
+    for number, argument in enumerate(schema.arguments if schema is not None else ()):
+        if argument.alias_info is not None:
+            return str(node.kwargs.get(argument.name) or node.args[number])
+    return ""
 
 
 def _require_bounded(program: ExportedProgram) -> None:

@@ -146,13 +146,14 @@ class Reading(TwoRates):
 
 class ReadingWritten(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        height = torch.zeros(1)
-        height[0] = state[0, 2]
+        height = torch.zeros(2)
+        height.split(1)[0][0] = state[0, 2]
         return super().predict_fast(feature, state, history, steps) * (100 - height[0].item())
 
 
 class ReadingConstants(TwoRates):
-    """Reads a table that it holds, and counts its instances in the class."""
+    """Reads a table that it holds beside tensors that it writes, and counts its instances in the
+    class."""
 
     ids = itertools.count()
 
@@ -161,7 +162,10 @@ class ReadingConstants(TwoRates):
         self.id, self.gains = next(self.ids), torch.linspace(0.5, 1, 4)
 
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        return super().predict_fast(feature, state, history, steps) * self.gains[1].item()
+        gains = torch.zeros(4)
+        gains[1:] = nn.functional.relu(state[:, :3] - state[:, :3], inplace=True)
+        chunk = super().predict_fast(feature, state, history, steps) + gains
+        return chunk * self.gains.split(2)[0][1].item()
 
 
 class Scripted(TwoRates):
