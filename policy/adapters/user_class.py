@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from types import ModuleType
+from types import MethodType, ModuleType
 
 from policy.adapters.description import Description
 from policy.adapters.interface import Interface
@@ -159,6 +159,15 @@ def _import_hint(error: BaseException | None) -> str:
     return "mend that line"
 
 
+def _add_predict(policy: object, kind: type) -> None:
+    """Give the fast pair of a class, which may be frozen or have slots, a ``predict``."""
+    try:
+        object.__setattr__(policy, "predict", MethodType(predict_by_pair, policy))
+    except AttributeError:  # slots: an instance of a subclass has it
+        members = {"predict": predict_by_pair, "__module__": kind.__module__, "__slots__": ()}
+        object.__setattr__(policy, "__class__", type(kind.__name__, (kind,), members))
+
+
 def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
     arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
     try:
@@ -173,9 +182,7 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
         policy: object = found(**arguments)
         has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
         if has_pair and getattr(policy, "predict", None) is None:
-            # A subclass, since a class may be frozen or have slots.
-            members = {"predict": predict_by_pair, "__module__": found.__module__, "__slots__": ()}
-            object.__setattr__(policy, "__class__", type(found.__name__, (found,), members))
+            _add_predict(policy, found)
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch

@@ -214,6 +214,14 @@ class FastPair:
         return np.full((1, 16, 4), feature[0, 0], np.float32)
 
 
+class RegisteredPair(FastPair):
+    def __init__(self):
+        self.predict = None  # hides a method of the class
+
+    def __init_subclass__(cls, *, name):
+        pass
+
+
 class NoFeatureDim(Single):
     contract = Contract(arrays="numpy")
     encode_visual = predict_fast = Single.predict
@@ -298,7 +306,8 @@ def test_an_unusable_class_is_refused(mine, name, changes, message):
         load(f"{mine}:{name}", **changes)
 
 
-def test_a_class_of_the_fast_pair_alone_flies_at_both_rates(mine: str) -> None:
-    dual, single = (load(f"{mine}:FastPair", dual_rate=is_dual) for is_dual in (True, False))
+@pytest.mark.parametrize("name", ["FastPair", "RegisteredPair"])
+def test_a_class_of_the_fast_pair_alone_flies_at_both_rates(mine: str, name: str) -> None:
+    dual, single = (load(f"{mine}:{name}", dual_rate=is_dual) for is_dual in (True, False))
     assert (dual.runner.dual_rate, single.runner.dual_rate) == (True, False)
     assert throttle(dual) == throttle(single) != 0.0
