@@ -136,9 +136,14 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
     first, *others = contract.cameras
-    unread = others if camera is None else []
-    damage = [f"{folder}: camera {other} is left out, only the first is read" for other in unread]
-    if others and camera not in (None, first, *others):
+    damage: list[str] = []
+    if camera is None:
+        damage = [
+            f"{folder}: camera {other} is left out, only the first is read" for other in others
+        ]
+    elif not others and camera != first:
+        damage = [f"{folder}: it has no camera {camera}: its only one, {first}, is read"]
+    elif camera not in (None, first, *others):
         raise DatasetError(f"{folder}: no camera {camera}; it has {[first, *others]}")
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     suffix = f"_{camera}" if camera in others else ""

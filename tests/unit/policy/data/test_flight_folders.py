@@ -78,6 +78,8 @@ def test_one_of_several_cameras_is_read(tmp_path: Path) -> None:
         episode = read_flight(folder, camera)
         assert episode.captured_ns[0] == first_ns
         assert len(list(episode.decode())) == 2
+    (damage,) = read_flight(flight(tmp_path / "c"), "down").damage
+    assert damage.endswith("it has no camera down: its only one, front, is read")
 
 
 def test_a_tick_counts_as_the_decision_behind_it_and_as_no_later_than_the_next(
