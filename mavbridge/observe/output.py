@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import TextIO, cast
+from typing import IO, TextIO, cast
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -185,25 +185,34 @@ class _Lines(io.TextIOBase):
 
 
 @contextmanager
-def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Redirect every printed line to ``show``, so that no thread waits for the console.
+def stray_lines_shown(show: Callable[[str], None], console: IO[str]) -> Iterator[None]:
+    """Redirect every line printed to the file of ``console`` to ``show``, so that no thread waits
+    for it.
 
-    This covers standard error (logging, warnings, tracebacks of threads), and standard output if it
-    is a terminal and thus the same console.
+    This covers standard error (logging, warnings, tracebacks of threads) and standard output, each
+    if it is that file: one sent elsewhere keeps its lines.
     """
-    old_out, old_err = sys.stdout, sys.stderr
-    is_console = old_out is not None and not old_out.closed and old_out.isatty()
-    shown = [_Lines(show, old_err)]
-    sys.stderr = shown[0]
-    if is_console:
-        shown.append(_Lines(show, old_out))
-        sys.stdout = shown[1]
+    replaced = {name: getattr(sys, name) for name in ("stdout", "stderr")}
+    shown = {
+        name: _Lines(show, stream)
+        for name, stream in replaced.items()
+        if _is_same_file(stream, console)
+    }
+    for name, lines in shown.items():
+        setattr(sys, name, lines)
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = old_out, old_err
-        for lines in shown:
+        for name, lines in shown.items():
+            setattr(sys, name, replaced[name])
             lines.finish()
+
+
+def _is_same_file(stream: TextIO | None, other: IO[str]) -> bool:
+    try:
+        return stream is not None and os.path.sameopenfile(stream.fileno(), other.fileno())
+    except (OSError, ValueError):  # closed, or a buffer in memory
+        return False
 
 
 @contextmanager
@@ -221,9 +230,10 @@ def messages_shown(console: Console, timeout_s: float) -> Iterator[MessageQueue]
 
     worker, output = Worker("mavbridge-terminal", show), console.file
     worker.start()
-    stray = stray_lines_shown(lambda line: messages.put(Text(line, style="dim")))
+    is_patient = isinstance(output, PatientOutput)
+    stray = stray_lines_shown(lambda line: messages.put(Text(line, style="dim")), output)
     try:
-        with stray if isinstance(output, PatientOutput) else nullcontext():
+        with stray if is_patient else nullcontext():
             yield messages
     finally:
         with suppress(HungError):

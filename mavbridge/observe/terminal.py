@@ -91,8 +91,9 @@ class FlightScreen:
         self._hint = hint
         if hint is not None and not self._console.is_terminal:
             self.show_message(hint)
-        if isinstance(self._console.file, PatientOutput):
-            self._redirection.enter_context(stray_lines_shown(self._show_stray))
+        output = self._console.file
+        if isinstance(output, PatientOutput):
+            self._redirection.enter_context(stray_lines_shown(self._show_stray, output))
         self._worker = Worker("mavbridge-terminal", self._run)
         self._worker.start()
 

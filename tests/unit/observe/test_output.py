@@ -3,9 +3,9 @@
 Whole flights of such a console are in tests/faults/catalogue: terminal-stalled, chatty-unread.
 """
 
-import io
 import os
 import sys
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -43,19 +43,26 @@ def test_a_reader_who_is_gone_is_written_to_no_more() -> None:
         assert not output.isatty()
 
 
-def test_what_anybody_prints_becomes_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("console", ["stdout", "stderr", "both"])
+def test_what_is_printed_to_the_file_of_the_console_becomes_messages(
+    console: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     shown: list[str] = []
-    errors, out = io.StringIO(), io.StringIO()
-    monkeypatch.setattr(sys, "stderr", errors)
-    monkeypatch.setattr(sys, "stdout", out)
-    with stray_lines_shown(shown.append):
-        sys.stderr.write("one\ntw")
-        sys.stderr.write("o\r\n" + 3000 * "x")
-        print("to a file")
-        sys.stderr.write("its last words")
-        kept = sys.stderr
-    print("afterwards", file=kept, flush=True)
-    assert shown.pop() == "afterwards"
-    assert shown == ["one", "two", 3000 * "x", "its last words"]
-    assert sys.stderr is errors
-    assert out.getvalue() == "to a file\n"
+    with (tmp_path / "out").open("w") as out, (tmp_path / "err").open("w") as errors:
+        streams = {"stdout": out, "stderr": out if console == "both" else errors}
+        for name, stream in streams.items():
+            monkeypatch.setattr(sys, name, stream)
+        with stray_lines_shown(shown.append, streams.get(console, out)):
+            kept = getattr(sys, "stderr" if console == "both" else console)
+            kept.write("one\ntw")
+            kept.write("o\r\n" + 3000 * "x")
+            for name in streams:
+                print(f"to {name}", file=getattr(sys, name))
+            kept.write("its last words")
+        print("afterwards", file=kept, flush=True)
+        assert {name: getattr(sys, name) for name in streams} == streams
+    others = [name for name in streams if console not in (name, "both")]
+    own = [f"to {name}" for name in streams if name not in others]
+    assert shown == ["one", "two", 3000 * "x", *own, "its last words", "afterwards"]
+    elsewhere = (tmp_path / "out").read_text() + (tmp_path / "err").read_text()
+    assert elsewhere == "".join(f"to {name}\n" for name in others)
