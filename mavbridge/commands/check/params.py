@@ -17,7 +17,7 @@ from mavbridge.mavlink.profiles.profile import (
     StreamGroup,
 )
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
+from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_risks
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 
@@ -50,7 +50,7 @@ class Terms:
         link = self.config.link
         kind: ActionKind = "sticks" if self.contract is None else self.contract.action
         output = self.profile.outputs[kind] if link.output == "auto" else link.output
-        serial = serial_dangers(self.settings, self.streams)
+        serial = serial_risks(self.settings, self.streams)
         return ParamContext(
             output,
             link.source_system,
@@ -100,12 +100,13 @@ class Terms:
         if self.assessment.unusable is not None:
             unusable = because(Code.CALIBRATION_UNUSABLE, cause=self.assessment.unusable)
             notes.append(ParamNote("obstacle", (), str(unusable)))
-        return notes + [danger.note(is_accepted=False) for danger in self.assessment.refused]
+        return notes + list(self.assessment.risks)
 
 
 def param_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield every relevant parameter, then the motion at full stick."""
-    refusals, warnings = terms.refusals(), list(terms.assessment.warnings)
+    refusals = terms.refusals()
+    warnings = [note for note in terms.assessment.notes if note.kind in ("advice", "hint")]
     told: list[ParamNote] = []
     wanted = terms.profile.wanted_params(terms.values, terms.context)
     for name, should_be in wanted.items():

@@ -22,7 +22,6 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
 )
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
-    Danger,
     ModeTable,
     ParamContext,
     ParamNote,
@@ -111,7 +110,6 @@ class ArduPilot(Profile):
         "manual-control": "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
     }
     params = _FIRST_NAMES
-    setpoint_timeout = "GUID_TIMEOUT"
     target_hz = 50.0
     stick_echo = StreamGroup(
         ("RC_CHANNELS",), RC_CHANNELS_HZ, True, dialect.MAV_DATA_STREAM_RC_CHANNELS
@@ -176,19 +174,6 @@ class ArduPilot(Profile):
         elif context.output is not None:
             yield from _setpoint_notes(values, context)
 
-    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """See `Profile`. Yield also settings under which sticks would stay for ever."""
-        yield from super().dangers(values, context)
-        if context.output != "rc-override":
-            return
-        time_s = values.get("RC_OVERRIDE_TIME", 0.0)
-        if time_s < 0:
-            why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
-            yield Danger("endless-override", why, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5")
-        if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
-            why = because(Code.NO_THROTTLE_FAILSAFE)
-            yield Danger("no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1")
-
     def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
         """See `Profile`."""
         if context.output == "rc-override":
@@ -247,12 +232,8 @@ def _override_notes(
             "RC_OPTIONS bit 1 (ignore overrides) is set",
             f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}",
         )
-    time_s = values.get("RC_OVERRIDE_TIME", 1.0)
-    if time_s == 0:
-        yield ParamNote.of(
-            "obstacle", "RC_OVERRIDE_TIME", time_s, ", which disables overrides", 0.5
-        )
     yield from stick_notes(values)
+    yield from _timeout_notes(values, context)
     for names, unknown in (
         (_RISK_NAMES, "it holds its last sticks for ever if this computer dies"),
         (SIMPLE_NAMES, f"{TURNED}the heading at arming"),
@@ -260,7 +241,6 @@ def _override_notes(
         if missing := [name for name in names if name not in values]:
             said = f"the vehicle has not sent {', '.join(missing)}: whether {unknown} is not known"
             yield ParamNote("advice", tuple(missing), said)
-    yield from long_timeout(values, "RC_OVERRIDE_TIME", "hold its last sticks")
     landing = values.get("FS_OPTIONS", _CONTINUE_LANDING)
     if context.has_receiver is False and not int(landing) & _CONTINUE_LANDING:
         effect = ": without a receiver, a landing turns into RTL when the sticks end"
@@ -275,6 +255,22 @@ def _override_notes(
         )
 
 
+def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
+    """Yield what ends overrides too early, too late or never."""
+    name, time_s = "RC_OVERRIDE_TIME", values.get("RC_OVERRIDE_TIME", 1.0)
+    if time_s == 0:
+        yield ParamNote.of("obstacle", name, time_s, ", which disables overrides", 0.5)
+    if time_s < 0:
+        why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
+        yield ParamNote.of_risk("endless-override", why, name, f"--set {name}=0.5")
+    yield from long_timeout(values, name, "hold its last sticks")
+    if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
+        why = because(Code.NO_THROTTLE_FAILSAFE)
+        yield ParamNote.of_risk(
+            "no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1"
+        )
+
+
 def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what misreads, keeps or weakens setpoints in GUIDED."""
     if context.output != "velocity":
@@ -285,7 +281,7 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
             effect = ", with which it takes our thrust for a climb rate"
             mended = int(options) | _THRUST_AS_THRUST
             yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
-    yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint")
+    yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
     if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
         yield ParamNote(
             "advice",

@@ -102,13 +102,13 @@ class EventMeaning(NamedTuple):
     """Text for the user, if no STATUSTEXT reports it."""
 
 
-NoteKind: TypeAlias = Literal["obstacle", "advice", "hint"]
-"""obstacle: the vehicle would not follow our commands, which the user cannot accept. advice: a
-warning. hint: an improvement, shown only by ``mavbridge check``."""
+NoteKind: TypeAlias = Literal["obstacle", "risk", "advice", "hint"]
+"""obstacle: the vehicle would not follow our commands, which the user cannot accept. risk: it would
+fly, but not safely. advice: a warning. hint: an improvement, shown only by ``mavbridge check``."""
 
 
 class ParamNote(NamedTuple):
-    """Remark about parameters, and the flag that fixes it."""
+    """Remark about parameters or the port, and the flag that fixes it."""
 
     kind: NoteKind
     names: tuple[str, ...]
@@ -118,6 +118,10 @@ class ParamNote(NamedTuple):
     """Flag that fixes it; empty: none."""
     or_else: str = ""
     """End of the sentence, after the flag."""
+    risk: Risk | None = None
+    """Name by which the user accepts a note of kind risk."""
+    refusal: Reason | None = None
+    """Reason for which a risk that is not accepted forbids a flight."""
 
     @classmethod
     def of(
@@ -133,50 +137,43 @@ class ParamNote(NamedTuple):
         cure = "" if mended is None else f"--set {name}={mended:g}"
         return cls(kind, (name,), f"{name} is {value:g}{effect}", cure, or_else)
 
+    @classmethod
+    def of_risk(cls, risk: Risk, why: Reason, name: str = "", cure: str = "") -> "ParamNote":
+        """Return the refusal of a risk; ``why`` names the flag that fixes it."""
+        refusal, names = because(Code.RISK, risk=risk, why=why), (name,) if name else ()
+        return cls("risk", names, str(why), cure, risk=risk, refusal=refusal)
+
+    def accepted(self) -> "ParamNote":
+        """Return the advice that replaces a risk once the user has accepted it."""
+        said = f"risk {self.risk} is accepted: {self.said}"
+        return ParamNote("advice", self.names, said, self.cure)
+
     @property
     def text(self) -> str:
         """Sentence for the user, with the flag."""
+        if self.refusal is not None:
+            return str(self.refusal)
         is_complete = self.cure in self.said
         return self.said if is_complete else f"{self.said}: use {self.cure}{self.or_else}"
 
 
 LONGEST_S = 1.0
 """Longest useful timeout; a longer one leaves the vehicle uncontrolled longer than necessary."""
-
-
-def long_timeout(values: Mapping[str, float], name: str, does: str) -> Iterator[ParamNote]:
-    """Yield advice if the vehicle would go on for too long after the death of the guard."""
-    if (time_s := values.get(name, 0.0)) > LONGEST_S:
-        effect = f": if this computer died, the vehicle would {does} for that many seconds"
-        yield ParamNote.of("advice", name, time_s, effect, 0.5)
-
-
-class Danger(NamedTuple):
-    """Setting with which the vehicle flies, but not safely."""
-
-    risk: Risk
-    why: Reason
-    """Names the flag that fixes it."""
-    name: str | None = None
-    """Parameter concerned."""
-    cure: str = ""
-
-    @property
-    def refusal(self) -> Reason:
-        """Reason to refuse a flight."""
-        return because(Code.RISK, risk=self.risk, why=self.why)
-
-    def note(self, *, is_accepted: bool) -> ParamNote:
-        """Return a note for a flight that is refused, or whose risk the user has accepted."""
-        accepted = f"risk {self.risk} is accepted: {self.why}"
-        names = () if self.name is None else (self.name,)
-        if is_accepted:
-            return ParamNote("advice", names, accepted, self.cure)
-        return ParamNote("obstacle", names, str(self.refusal), self.cure)
-
-
 _LONGEST_SETPOINT_S = 3.0
 """Longest time to follow the last setpoint of a dead guard; ArduPilot's default."""
+
+
+def long_timeout(
+    values: Mapping[str, float], name: str, does: str, *, is_setpoint: bool = False
+) -> Iterator[ParamNote]:
+    """Yield a note if the vehicle would go on for too long after the death of the guard."""
+    time_s = values.get(name, 0.0)
+    if is_setpoint and time_s > _LONGEST_SETPOINT_S:
+        why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
+        yield ParamNote.of_risk("long-setpoint", why, name, f"--set {name}=0.5")
+    if time_s > LONGEST_S:
+        effect = f": if this computer died, the vehicle would {does} for that many seconds"
+        yield ParamNote.of("advice", name, time_s, effect, 0.5)
 
 
 class ParamContext(NamedTuple):
@@ -191,8 +188,8 @@ class ParamContext(NamedTuple):
     version: str | None = None
     """Version of the firmware, like 1.18.0; None: unknown."""
     accepted_risks: tuple[Risk, ...] = ()
-    serial: tuple[Danger, ...] = ()
-    """Dangers of the serial port."""
+    serial: tuple[ParamNote, ...] = ()
+    """Risks of the serial port."""
 
 
 class Profile(ABC):
@@ -213,8 +210,6 @@ class Profile(ABC):
     """True if LOCAL_POSITION_NED also comes without a valid estimate: see the estimator's flags."""
     shows_rates: ClassVar[bool] = False
     """True if ATTITUDE_TARGET shows body rates as sent, but not their thrust."""
-    setpoint_timeout: ClassVar[str]
-    """Parameter of the time for which the last setpoint is followed [s]."""
     target_hz: ClassVar[float]
     """Rate of ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED for the echo check."""
     stick_echo: ClassVar[StreamGroup]
@@ -282,15 +277,10 @@ class Profile(ABC):
 
     @abstractmethod
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield settings that prevent, weaken or change a flight, each with its remedy."""
+        """Yield settings that prevent, endanger, weaken or change a flight, each with its remedy.
 
-    def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Yield settings with which it flies, but not safely, including accepted ones."""
-        name, time_s = self.setpoint_timeout, values.get(self.setpoint_timeout, 0.0)
-        is_setpoint = context.output not in (None, self.outputs["sticks"])
-        if is_setpoint and time_s > _LONGEST_SETPOINT_S:
-            why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
-            yield Danger("long-setpoint", why, name, f"--set {name}=0.5")
+        Includes risks that the user has accepted.
+        """
 
     @abstractmethod
     def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:

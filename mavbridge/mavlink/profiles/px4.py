@@ -177,7 +177,6 @@ class Px4(Profile):
     }
     sends_invalid_estimates = True
     shows_rates = True
-    setpoint_timeout = "COM_OF_LOSS_T"
     target_hz = 100.0
     stick_echo = StreamGroup(("MANUAL_CONTROL",), FAST_HZ, least_hz=0.0)
     """Shows the selected sticks at the sender's rate."""
@@ -377,7 +376,8 @@ def _end_notes(
     values: Mapping[str, float], time: str, action: str, fatal: Mapping[int, str]
 ) -> Iterator[ParamNote]:
     """Yield unexpected effects of the end of our packets, by two parameters."""
-    yield from long_timeout(values, time, "go on with the last it was told")
+    does, is_setpoint = "go on with the last it was told", time == "COM_OF_LOSS_T"
+    yield from long_timeout(values, time, does, is_setpoint=is_setpoint)
     if (time_s := values.get(time, LONGEST_S)) < _SHORTEST_S:
         effect = ": a pause of our packets as short as that is a failsafe"
         yield ParamNote.of("advice", time, time_s, effect)

@@ -211,7 +211,8 @@ class VehicleSession:
             case ParamAbsent(name):
                 self.params.absent(name)
             case AutopilotVersion(version):
-                self.version = self.params.version = version
+                self.version = version
+                self.params.use_version(version)
             case StatusText():
                 self._show(*self._texts.receive(body, arrived_ns))
             case Event(event_id) if (meaning := self.profile.events.get(event_id)) is not None:

@@ -11,13 +11,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.frames import SIGNATURE_BYTES
 from mavbridge.mavlink.codec.readers import IDS
-from mavbridge.mavlink.profiles.profile import (
-    Danger,
-    ParamContext,
-    ParamNote,
-    Profile,
-    StreamGroup,
-)
+from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
 
 _FRAME_BYTES = 12
 """Header and checksum of MAVLink 2."""
@@ -40,9 +34,7 @@ class Assessment(NamedTuple):
     override_switch: int | None
     """Number of the channel that enables the output."""
     notes: tuple[ParamNote, ...]
-    refused: tuple[Danger, ...]
-    """Dangers that the user has not accepted."""
-    accepted: tuple[Danger, ...]
+    """All notes; those of kind risk are not accepted."""
 
     @property
     def obstacles(self) -> tuple[ParamNote, ...]:
@@ -50,10 +42,9 @@ class Assessment(NamedTuple):
         return tuple(note for note in self.notes if note.kind == "obstacle")
 
     @property
-    def warnings(self) -> tuple[ParamNote, ...]:
-        """Accepted dangers, advice and hints."""
-        dangers = (danger.note(is_accepted=True) for danger in self.accepted)
-        return (*dangers, *(note for note in self.notes if note.kind != "obstacle"))
+    def risks(self) -> tuple[ParamNote, ...]:
+        """Risks that the user has not accepted."""
+        return tuple(note for note in self.notes if note.kind == "risk")
 
     def endangers(self, before: "Assessment") -> bool:
         """True if these parameters must end a flight that began with ``before``."""
@@ -62,7 +53,7 @@ class Assessment(NamedTuple):
             or self.override_switch != before.override_switch
             or not {each.names for each in self.obstacles}
             <= {each.names for each in before.obstacles}
-            or not {each.risk for each in self.refused} <= {each.risk for each in before.refused}
+            or not {each.risk for each in self.risks} <= {each.risk for each in before.risks}
         )
 
 
@@ -75,15 +66,14 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
         ours = profile.calibration(values)
     except ValueError as error:
         unusable = str(error) if is_override else None
-    dangers = (*context.serial, *profile.dangers(values, context))
+    notes = (*context.serial, *profile.notes(values, context))
+    accepted = context.accepted_risks
     return Assessment(
         context,
         ours,
         unusable,
         profile.override_switch(values) if is_override else None,
-        tuple(profile.notes(values, context)),
-        refused=tuple(each for each in dangers if each.risk not in context.accepted_risks),
-        accepted=tuple(each for each in dangers if each.risk in context.accepted_risks),
+        tuple(note.accepted() if note.risk in accepted else note for note in notes),
     )
 
 
@@ -97,8 +87,8 @@ def received_bytes_per_s(streams: Iterable[StreamGroup], frame_bytes: int = _FRA
     return _OTHERS_BYTES_PER_S + streamed
 
 
-def serial_dangers(settings: LinkSettings, streams: Iterable[StreamGroup]) -> tuple[Danger, ...]:
-    """Return the danger of a serial port's baud rate that is too low.
+def serial_risks(settings: LinkSettings, streams: Iterable[StreamGroup]) -> tuple[ParamNote, ...]:
+    """Return the risk of a serial port's baud rate that is too low.
 
     A serial port carries both directions at once, so the fuller one decides.
     """
@@ -111,4 +101,4 @@ def serial_dangers(settings: LinkSettings, streams: Iterable[StreamGroup]) -> tu
         return ()
     enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), needed)
     why = because(Code.SLOW_SERIAL, baud=baud, needed=needed, enough=enough)
-    return (Danger("slow-serial", why),)
+    return (ParamNote.of_risk("slow-serial", why),)

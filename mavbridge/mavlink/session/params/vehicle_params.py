@@ -10,7 +10,7 @@ from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.profile import ParamContext, Profile, StreamGroup
-from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
+from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_risks
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
 
 _WINDOW = 16
@@ -99,10 +99,8 @@ class VehicleParams:
         self._profile = profile
         self._config = config
         self._report = report
-        self._output: Output | None = None
-        self.version: str | None = None
-        """Version of the firmware; None until it is read."""
-        self._serial = serial_dangers(config, streams)
+        risks, port = config.accepted_risks, serial_risks(config, streams)
+        self._context = ParamContext(None, config.source_system, None, None, risks, port)
         self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
@@ -136,7 +134,11 @@ class VehicleParams:
 
     def use_output(self, output: Output) -> None:
         """Check the parameters for this output from now on."""
-        self._output = output
+        self._context = self._context._replace(output=output)
+
+    def use_version(self, version: str) -> None:
+        """Check the parameters for this version of the firmware from now on."""
+        self._context = self._context._replace(version=version)
 
     def receive(self, param: ParamValue, status: VehicleStatus | None) -> None:
         """Process a PARAM_VALUE, requested or not."""
@@ -157,7 +159,8 @@ class VehicleParams:
             and (command := self._profile.follow_up(param.name, old, param.value)) is not None
         ):
             self._follow_ups[command] = (_FOLLOW_UPS, 0)
-        before, after = self._assessed, self._assess(status)
+        before, self._assessed = self._assessed, None
+        after = self._current(status)
         is_armed = status is not None and status.armed
         if not is_armed or old is None or before is None:
             return
@@ -169,21 +172,6 @@ class VehicleParams:
     def absent(self, name: str) -> None:
         """Note that the vehicle has no parameter of this name."""
         self._reader.absent(name)
-
-    def _context(self, status: VehicleStatus | None) -> ParamContext:
-        has_receiver, config = None if status is None else status.has_receiver, self._config
-        return ParamContext(
-            self._output,
-            config.source_system,
-            has_receiver,
-            self.version,
-            config.accepted_risks,
-            self._serial,
-        )
-
-    def _assess(self, status: VehicleStatus | None) -> Assessment:
-        self._assessed = assess(self._profile, self.values, self._context(status))
-        return self._assessed
 
     def step(
         self, now_ns: int, status: VehicleStatus | None
@@ -226,7 +214,7 @@ class VehicleParams:
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
         self.is_read = True
-        assessment = self._assessed or self._assess(status)
+        assessment = self._current(status)
         if assessment.calibration == self.calibration:
             return
         is_armed = status is not None and status.armed
@@ -236,22 +224,24 @@ class VehicleParams:
             self.calibration = assessment.calibration
 
     def _advise(self, status: VehicleStatus | None) -> None:
-        context = self._context(status)
+        assessment = self._current(status)
+        context = assessment.context
         has_output = context.output is not None and self._config.pilot_hz is None
         if not has_output or context == self._advised or not self.changes.is_settled:
             return
         self._advised = context
-        for note in self._current(status).warnings:
+        for note in assessment.notes:
             if note.kind == "advice":
                 self._report(AdviceText(note.text))
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:
         """Return why the parameters forbid a flight with the chosen output, or None."""
-        if not self.is_read or self._output is None:
+        output = self._context.output
+        if not self.is_read or output is None:
             return None
         assessment = self._current(status)
         if assessment.obstacles:
-            is_sticks = self._output in ("rc-override", "manual-control")
+            is_sticks = output in ("rc-override", "manual-control")
             what = (
                 "ignore our sticks, or take them otherwise"
                 if is_sticks
@@ -264,12 +254,15 @@ class VehicleParams:
             )
         if assessment.unusable is not None:
             return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
-        if self._output == "rc-override" and assessment.calibration != self.calibration:
+        if output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
-        return assessment.refused[0].refusal if assessment.refused else None
+        return assessment.risks[0].refusal if assessment.risks else None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
-        """Return the assessment for the present output and receiver."""
-        if self._assessed is None or self._assessed.context != self._context(status):
-            return self._assess(status)
+        """Return the assessment of the present values, output and receiver."""
+        has_receiver = None if status is None else status.has_receiver
+        if has_receiver != self._context.has_receiver:
+            self._context = self._context._replace(has_receiver=has_receiver)
+        if self._assessed is None or self._assessed.context is not self._context:
+            self._assessed = assess(self._profile, self.values, self._context)
         return self._assessed

@@ -196,12 +196,6 @@ def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
     ]
 
 
-def test_setpoints_that_stop_are_never_held_for_ever() -> None:
-    values = {"RC_OVERRIDE_TIME": -1.0, "FS_THR_ENABLE": 0.0}
-    assert list(ARDUPILOT.dangers(values, ParamContext("velocity", 255, False))) == []
-    assert len(list(ARDUPILOT.dangers(values, ParamContext("rc-override", 255, False)))) == 2
-
-
 @pytest.mark.parametrize(
     ("name", "values", "refused", "mended"),
     [("COM_RC_IN_MODE", range(9), (0, 4), 1), ("MAN_KILL_GEST_T", (-1, 0, 2), (0, 2), -1)],
@@ -244,7 +238,7 @@ def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
     profile: Profile, name: str, sticks: Output
 ) -> None:
     for output in ("attitude", "rates", "velocity"):
-        assert list(profile.dangers({name: 3.0}, ParamContext(output, 255, True))) == []
-        (danger,) = profile.dangers({name: 3.5}, ParamContext(output, 255, True))
-        assert (danger.risk, f"--set {name}=0.5" in danger.cure) == ("long-setpoint", True)
-    assert list(profile.dangers({name: 3.5}, ParamContext(sticks, 255, True))) == []
+        assert notes_of(profile, {name: 3.0}, output, kind="risk") == []
+        (risk,) = notes_of(profile, {name: 3.5}, output, kind="risk")
+        assert (risk.risk, f"--set {name}=0.5" in risk.cure) == ("long-setpoint", True)
+    assert notes_of(profile, {name: 3.5}, sticks, kind="risk") == []
