@@ -11,9 +11,18 @@ from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import Body, Endpoint
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
-from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.profiles.profile import Profile, Traits
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.vehicle import VehicleSession
+
+
+class _Params(SimpleNamespace):
+    """Parameters of a profile, and what they make of the vehicle."""
+
+    @property
+    def traits(self) -> Traits:
+        traits: Traits = self.profile.traits(self.values)
+        return traits
 
 
 class FlownVehicle:
@@ -24,7 +33,7 @@ class FlownVehicle:
         self.identity = VehicleIdentity(
             source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=3
         )
-        self.params = SimpleNamespace(is_read=True, calibration=calibration, values={})
+        self.params = _Params(profile=profile, is_read=True, calibration=calibration, values={})
         self.condition = SimpleNamespace(is_receiver_hidden=False, is_released=True)
         self.mode = profile.modes.roles.setpoint[0]
         self.armed = True

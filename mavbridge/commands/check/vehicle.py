@@ -361,7 +361,7 @@ def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[Che
 
 def _receiver_row(vehicle: VehicleSession, status: VehicleStatus) -> CheckRow:
     name, expected = "radio receiver", "a pilot who can take over"
-    if vehicle.params.ignores_receiver and vehicle.condition.has_receiver:
+    if vehicle.params.traits.ignores_receiver and vehicle.condition.has_receiver:
         text = "neither its sticks nor its switches count: set COM_RC_IN_MODE to 6 (PX4 1.17)"
         return _row(name, "ignored by COM_RC_IN_MODE", expected, text)
     if not status.has_receiver:

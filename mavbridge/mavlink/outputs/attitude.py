@@ -142,9 +142,7 @@ class AttitudeOutput(SetpointOutput):
             raise CommandRefusedError(f"{action} is not finite, or its thrust not in [0, 1]")
         if self._scale is None or self._sent_ns is None or now_ns - self._sent_ns > _PAUSE_NS:
             self._scale = self._thrust_scale(vehicle)
-        is_boosted = isinstance(action, BodyRates) and vehicle.profile.boosts_thrust(
-            vehicle.params.values
-        )
+        is_boosted = isinstance(action, BodyRates) and vehicle.params.traits.boosts_thrust
         boost = self._cos_tilt if is_boosted else 1.0
         scale = self._scale * boost
         shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)

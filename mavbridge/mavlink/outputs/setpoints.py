@@ -123,7 +123,7 @@ class VelocityOutput(SetpointOutput):
             raise CommandRefusedError(f"{type(action).__name__} is no velocity")
         if not all(map(math.isfinite, action)):
             raise CommandRefusedError(f"{action} is not finite")
-        climb_mps, descent_mps = vehicle.profile.climb_limits(vehicle.params.values)
+        climb_mps, descent_mps = vehicle.params.traits.climb_limits_mps
         down_mps = min(max(action.z_mps, -climb_mps), descent_mps)
         shown = self.echo.with_dither((round(down_mps * MM_PER_M),), now_ns)
         sent = action._replace(z_mps=shown[0] / MM_PER_M)

@@ -251,8 +251,7 @@ class ManualControlOutput(StickOutput):
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
         """True if our sticks are slower than a hand, by this firmware version's parameter."""
-        hand_per_s = vehicle.profile.hand_per_s(vehicle.params.values)
-        return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
+        return self._speeds.fastest_per_s < _REST_SHARE * vehicle.params.traits.hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the four sticks, rounded."""

@@ -27,6 +27,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamNote,
     Profile,
     StreamGroup,
+    Traits,
     condition_streams,
     long_timeout,
 )
@@ -116,7 +117,6 @@ class ArduPilot(Profile):
     )
     """Shows overrides exactly."""
     hover_param = "MOT_THST_HOVER"
-    boost_param = "ATC_ANGLE_BOOST"
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
         """See `Profile`. Legacy streams serve links on which no command is acknowledged.
@@ -145,18 +145,16 @@ class ArduPilot(Profile):
         """Return the calibration from RCMAP_* and RCn_*."""
         return calibration(values)
 
-    def override_switch(self, values: Mapping[str, float]) -> int | None:
-        """Return the channel with RCn_OPTION 46, or None."""
+    def traits(self, values: Mapping[str, float]) -> Traits:
+        """See `Profile`."""
         options = {number: values.get(f"RC{number}_OPTION") for number in OPTION_CHANNELS}
-        return next((n for n, option in options.items() if option == _OVERRIDE_SWITCH_OPTION), None)
-
-    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """True if bit 0 of RC_OPTIONS is set."""
-        return bool(int(values.get("RC_OPTIONS", 0)) & _IGNORE_RECEIVER)
-
-    def keeps_sticks(self, values: Mapping[str, float]) -> bool:
-        """True without the throttle failsafe (FS_THR_ENABLE 0)."""
-        return values.get("FS_THR_ENABLE") == 0
+        switches = [n for n, option in options.items() if option == _OVERRIDE_SWITCH_OPTION]
+        return Traits(
+            override_switch=switches[0] if switches else None,
+            ignores_receiver=bool(int(values.get("RC_OPTIONS", 0)) & _IGNORE_RECEIVER),
+            keeps_sticks=values.get("FS_THR_ENABLE") == 0,
+            boosts_thrust=values.get("ATC_ANGLE_BOOST", 1.0) != 0,
+        )
 
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
         """Return "Simple mode off": without it the mode stays on until the mode switch moves."""
@@ -170,14 +168,14 @@ class ArduPilot(Profile):
             said = "this is an ArduPlane, and only the modes of ArduCopter are known"
             yield ParamNote("obstacle", ("Q_ENABLE",), said)
         if context.output == "rc-override":
-            yield from _override_notes(values, context, self.override_switch(values))
+            yield from _override_notes(values, context, self.traits(values).override_switch)
         elif context.output is not None:
             yield from _setpoint_notes(values, context)
 
     def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
         """See `Profile`."""
         if context.output == "rc-override":
-            switch = self.override_switch(values)
+            switch = self.traits(values).override_switch
             return {
                 "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID": (
                     f"{context.source_system}, our system id"

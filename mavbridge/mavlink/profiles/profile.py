@@ -192,6 +192,25 @@ class ParamContext(NamedTuple):
     """Risks of the serial port."""
 
 
+class Traits(NamedTuple):
+    """What a vehicle's parameters make of it."""
+
+    override_switch: int | None = None
+    """Number of the radio channel that enables overrides."""
+    ignores_receiver: bool = False
+    """True if it ignores the sticks of a receiver, even if there is one."""
+    falls_back: bool = False
+    """True if a receiver's sticks count again once ours have ended, without a failsafe."""
+    keeps_sticks: bool = False
+    """True if overrides that have ended are shown for ever, as from a healthy receiver."""
+    boosts_thrust: bool = False
+    """True if it divides a setpoint's thrust by the cosine of its tilt."""
+    hand_per_s: float = math.inf
+    """Stick speed that ends an autonomous mode [full sticks/s]."""
+    climb_limits_mps: tuple[float, float] = (math.inf, math.inf)
+    """Climb and descent to which it clips velocity setpoints and their echo."""
+
+
 class Profile(ABC):
     """Properties of one firmware; immutable, one instance serves all vehicles."""
 
@@ -216,8 +235,6 @@ class Profile(ABC):
     """Message that shows the sticks that the vehicle acts on."""
     hover_param: ClassVar[str]
     """Parameter of the hover thrust in [0, 1], by the vehicle's own estimate."""
-    boost_param: ClassVar[str | None] = None
-    """Parameter that is not 0 if thrust is raised in a lean; None: it never is."""
     has_rc_channels_always: ClassVar[bool] = True
     """True if RC_CHANNELS also comes without a receiver."""
     events: ClassVar[Mapping[int, EventMeaning]] = {}
@@ -255,21 +272,9 @@ class Profile(ABC):
         """
         return None
 
-    def override_switch(self, values: Mapping[str, float]) -> int | None:
-        """Return the number of the radio channel that enables overrides, or None."""
-        return None
-
-    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """True if the vehicle ignores the sticks of a receiver, even if there is one."""
-        return False
-
-    def falls_back(self, values: Mapping[str, float]) -> bool:
-        """True if a receiver's sticks count again once ours have ended, without a failsafe."""
-        return False
-
-    def keeps_sticks(self, values: Mapping[str, float]) -> bool:
-        """True if overrides that have ended are shown for ever, as from a healthy receiver."""
-        return False
+    @abstractmethod
+    def traits(self, values: Mapping[str, float]) -> Traits:
+        """Return what these parameters make of the vehicle."""
 
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
         """Return the command that a parameter change for a flight needs to take effect, or None."""
@@ -294,18 +299,6 @@ class Profile(ABC):
 
         Request it again when parameters or the mode change. ``gains`` None: sticks stay unchanged.
         """
-
-    def boosts_thrust(self, values: Mapping[str, float]) -> bool:
-        """True if the vehicle divides a setpoint's thrust by the cosine of its tilt."""
-        return self.boost_param is not None and values.get(self.boost_param, 1.0) != 0
-
-    def hand_per_s(self, values: Mapping[str, float]) -> float:
-        """Return the stick speed that ends an autonomous mode [full sticks/s]."""
-        return math.inf
-
-    def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Return climb and descent [m/s] to which it clips velocity setpoints and their echo."""
-        return math.inf, math.inf
 
     @abstractmethod
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:

@@ -21,6 +21,7 @@ from mavbridge.mavlink.profiles.profile import (
     ParamNote,
     Profile,
     StreamGroup,
+    Traits,
     condition_streams,
     long_timeout,
 )
@@ -49,6 +50,8 @@ _UNEVEN_HZ = 150.0
 """Rate above which a request for the rate itself yields less than one for ``FAST_HZ``."""
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
 """Values of COM_RC_IN_MODE that exclude MAVLink's sticks."""
+_NO_RECEIVER = (1, 4)
+"""Values of COM_RC_IN_MODE that exclude a receiver's sticks: only MAVLink's, or none."""
 _MAVLINK_FIRST = (6, 8)
 """Values of COM_RC_IN_MODE that prefer MAVLink's sticks, and without them take a receiver's."""
 _NO_RESCALE = 1
@@ -220,13 +223,16 @@ class Px4(Profile):
         """Return the parameters for the source of sticks and for hover thrust."""
         return ("COM_RC_IN_MODE", "MPC_THR_HOVER")
 
-    def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """True if COM_RC_IN_MODE is 1 (sticks only from MAVLink) or 4 (no sticks)."""
-        return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
-
-    def falls_back(self, values: Mapping[str, float]) -> bool:
-        """See `Profile`."""
-        return values.get("COM_RC_IN_MODE") in _MAVLINK_FIRST
+    def traits(self, values: Mapping[str, float]) -> Traits:
+        """See `Profile`. Below 0, limits of climb and descent would reverse the motion."""
+        source = values.get("COM_RC_IN_MODE")
+        limits = values.get("MPC_Z_VEL_MAX_UP", 3.0), values.get("MPC_Z_VEL_MAX_DN", 1.5)
+        return Traits(
+            ignores_receiver=source in _NO_RECEIVER,
+            falls_back=source in _MAVLINK_FIRST,
+            hand_per_s=_hand_per_s(values),
+            climb_limits_mps=(max(limits[0], 0.0), max(limits[1], 0.0)),
+        )
 
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """See `Profile`."""
@@ -291,22 +297,6 @@ class Px4(Profile):
             lean=_lean(values["MPC_MAN_TILT_MAX"], is_tangent=mode == _CLIMB_MODE),
         )
 
-    def hand_per_s(self, values: Mapping[str, float]) -> float:
-        """See `Profile`. 1.18 has MAN_OVERRIDE_SPD (negative: off).
-
-        Before, COM_RC_STICK_OV is a percentage, on by bit 0 of COM_RC_OVERRIDE.
-        """
-        if (hand_per_s := values.get("MAN_OVERRIDE_SPD")) is None:
-            is_on = int(values.get("COM_RC_OVERRIDE", 1)) & 1
-            hand_per_s = values.get("COM_RC_STICK_OV", 100.0 * _SLOWEST_HAND_PER_S) / 100.0
-            hand_per_s = hand_per_s if is_on else -1.0
-        return hand_per_s if hand_per_s > 0.0 else math.inf
-
-    def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Return MPC_Z_VEL_MAX_UP and _DN; below 0 they would reverse the motion."""
-        climb_mps = values.get("MPC_Z_VEL_MAX_UP", 3.0)
-        return max(climb_mps, 0.0), max(values.get("MPC_Z_VEL_MAX_DN", 1.5), 0.0)
-
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
         """Return NAV_TAKEOFF, which enters AUTO.TAKEOFF, with a height above mean sea level.
 
@@ -318,6 +308,18 @@ class Px4(Profile):
         return CommandRequest(
             dialect.MAV_CMD_NAV_TAKEOFF, (here, 0, 0, here, here, here, amsl_m + height_m)
         )
+
+
+def _hand_per_s(values: Mapping[str, float]) -> float:
+    """Return the speed by MAN_OVERRIDE_SPD of 1.18 (negative: off).
+
+    Before, COM_RC_STICK_OV is a percentage, on by bit 0 of COM_RC_OVERRIDE.
+    """
+    if (hand_per_s := values.get("MAN_OVERRIDE_SPD")) is None:
+        is_on = int(values.get("COM_RC_OVERRIDE", 1)) & 1
+        hand_per_s = values.get("COM_RC_STICK_OV", 100.0 * _SLOWEST_HAND_PER_S) / 100.0
+        hand_per_s = hand_per_s if is_on else -1.0
+    return hand_per_s if hand_per_s > 0.0 else math.inf
 
 
 def _expo(values: Mapping[str, float], name: str) -> Bend | None:

@@ -8,7 +8,6 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
-from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Body,
@@ -22,6 +21,7 @@ from mavbridge.mavlink.codec.messages import (
     SystemStatus,
 )
 from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 
 _T = TypeVar("_T")
 SETTLE_NS = 100 * NS_PER_MS
@@ -39,13 +39,11 @@ _HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_H
 class VehicleCondition:
     """Combines the slow messages of one vehicle into one ``VehicleStatus``."""
 
-    def __init__(self, profile: Profile, *, min_battery_percent: float) -> None:
-        self._profile = profile
+    def __init__(
+        self, profile: Profile, params: VehicleParams, *, min_battery_percent: float
+    ) -> None:
+        self._profile, self._params = profile, params
         self._min_battery_percent = min_battery_percent
-        self.calibration: RcCalibration | None = None
-        """Radio calibration of the flight, if sticks pass through one."""
-        self.keeps_sticks = False
-        """True if overrides that have ended go on to look like a healthy receiver."""
         self.heartbeat: tuple[int, Heartbeat] | None = None
         self._custom_mode = 0
         self._mode_ns: int | None = None
@@ -68,6 +66,8 @@ class VehicleCondition:
         """True if RC_CHANNELS held a radio's sticks before our first override."""
         self._is_rc_healthy: bool | None = None
         """Receiver health by SYS_STATUS before our first override; None: not reported."""
+        self.receiver_due_ns: int | None = None
+        """Deadline for a receiver to appear; None until the streams are granted."""
         self._status: VehicleStatus | None = None
         self._status_ns = 0
 
@@ -129,7 +129,7 @@ class VehicleCondition:
             self._is_failsafe, self._changed_ns = True, arrived_ns
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
-        calibration, self.rc, self._rc_sticks = self.calibration, (arrived_ns, rc), None
+        calibration, self.rc, self._rc_sticks = self._params.calibration, (arrived_ns, rc), None
         pwm_us = calibration.stick_channels_us(rc.channels_us) if calibration else None
         if calibration and pwm_us and all(pwm_us):
             self._rc_sticks = calibration.to_sticks(pwm_us)
@@ -137,7 +137,8 @@ class VehicleCondition:
         channels_us = rc.channels_us[:4] if pwm_us is None else pwm_us
         if not self.is_receiver_hidden and channels_us:
             radio = [value_us for value_us in rc.channels_us if value_us in RADIO_US]
-            has_more = len(radio) > len(channels_us) or not self.keeps_sticks
+            # Overrides that have ended may go on to look like a healthy receiver.
+            has_more = len(radio) > len(channels_us) or not self._params.traits.keeps_sticks
             self._is_rc_plausible = has_more and all(us in RADIO_US for us in channels_us)
         if self.is_released and self.has_receiver:
             self._pilot_sticks = self._rc_sticks
@@ -161,10 +162,11 @@ class VehicleCondition:
         """True if the autopilot's arming checks have passed; None: not reported."""
         return self._system_bit(dialect.MAV_SYS_STATUS_PREARM_CHECK)
 
-    @property
-    def has_seen_radio(self) -> bool:
-        """True if both messages that show a receiver have arrived."""
-        return self.rc is not None and self._last(SystemStatus) is not None
+    def is_receiver_settled(self, now_ns: int) -> bool:
+        """True if both messages that show a receiver have arrived, or the wait for them is over."""
+        has_seen_radio = self.rc is not None and self._last(SystemStatus) is not None
+        due_ns = self.receiver_due_ns
+        return has_seen_radio or (due_ns is not None and now_ns >= due_ns)
 
     def is_velocity_usable(self, now_ns: int) -> bool:
         """False for a velocity that the firmware sends without a valid estimate."""
@@ -181,19 +183,15 @@ class VehicleCondition:
         estimator = self._last(EstimatorFlags, now_ns)
         return None if estimator is None else estimator.flags
 
-    def status(
-        self, now_ns: int, *, is_receiver_settled: bool, ignores_receiver: bool
-    ) -> VehicleStatus | None:
-        """Return the vehicle's status; None before its first heartbeat.
-
-        ``is_receiver_settled``: no receiver will appear that has not been seen yet.
-        """
+    def status(self, now_ns: int) -> VehicleStatus | None:
+        """Return the vehicle's status; None before its first heartbeat."""
         if self.heartbeat is None:
             return None
         if self._status is None or not 0 <= now_ns - self._status_ns < _STATUS_NS:
             has_receiver = self.has_receiver
             is_absent = has_receiver is None and not self._profile.has_rc_channels_always
-            if is_receiver_settled and (is_absent or (has_receiver and ignores_receiver)):
+            is_ignored = has_receiver and self._params.traits.ignores_receiver
+            if (is_absent or is_ignored) and self.is_receiver_settled(now_ns):
                 has_receiver = False
             self._status, self._status_ns = self._status_at(now_ns, has_receiver), now_ns
         return self._status

@@ -16,7 +16,6 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import ModeRoles, Output, VehicleStatus, said_by_vehicle
 from mavbridge.mavlink.codec.messages import (
-    RESTART_STAMPS,
     RESTART_STEP_US,
     Attitude,
     AutopilotVersion,
@@ -30,6 +29,7 @@ from mavbridge.mavlink.codec.messages import (
     RcChannels,
     ReceivedMessage,
     Request,
+    StampOrder,
     StatusText,
     later_by_us,
 )
@@ -150,9 +150,6 @@ class VehicleSession:
         self.identity = identity
         self.report = report
         """Shows a text to the user."""
-        self.condition = VehicleCondition(
-            self.profile, min_battery_percent=config.min_battery_percent
-        )
         self._texts = TextJoiner()
         self.version: str | None = None
         self._version_attempts = 0
@@ -162,15 +159,14 @@ class VehicleSession:
         self.params = VehicleParams(
             self.profile, config, streams=streams, old_params=old_params, report=report
         )
-        self._receiver_due_ns: int | None = None
-        """Deadline for a receiver to appear; None until the streams are granted."""
+        self.condition = VehicleCondition(
+            self.profile, self.params, min_battery_percent=config.min_battery_percent
+        )
         self._switch = Switch()
         """Override switch; between high and low it keeps its state, as in the vehicle."""
-        self._boot_ms = 0
-        self._stamped_ns = 0
-        self._silent_ns = 0
-        """Silence before the first old timestamp."""
-        self._old_stamps = 0
+        self._boot_order, self._stamped_ns = StampOrder(), 0
+        self.has_rebooted = False
+        """True if the vehicle's clock has restarted since it was last heard."""
         self._upset: tuple[int, Reason] | None = None
         self._mode_sequence, self._mode_ns = 0, -SETTLE_NS
         """Sequence number and arrival of the last HEARTBEAT or CURRENT_MODE."""
@@ -184,23 +180,16 @@ class VehicleSession:
         """Request the height above home, often enough to fly by."""
         self._streams.add(HOME_HEIGHT)
 
-    @property
-    def has_rebooted(self) -> bool:
-        """True if the vehicle's clock has restarted since it was last heard."""
-        return self._old_stamps >= RESTART_STAMPS
-
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
         """Process one message from this vehicle."""
         self._streams.receive(message.name, arrived_ns)
         body = message.body
         if isinstance(body, Heartbeat | CurrentMode) and self._is_overtaken(message, arrived_ns):
             return
-        self.condition.calibration = self.params.calibration
-        self.condition.keeps_sticks = self.profile.keeps_sticks(self.params.values)
         self.condition.receive(body, arrived_ns)
         match body:
             case Attitude():
-                self._watch_boot(body.boot_us // 1000, arrived_ns)
+                self._watch_boot(body.boot_us, arrived_ns)
             case RcChannels(channels_us) if (switch := self.params.override_switch) is not None:
                 in_range = switch <= len(channels_us)
                 self._switch.read(channels_us[switch - 1] if in_range else 0, arrived_ns)
@@ -233,20 +222,19 @@ class VehicleSession:
         for text in texts:
             self.report(said_by_vehicle(text))
 
-    def _watch_boot(self, boot_ms: int, arrived_ns: int) -> None:
-        back_us = -later_by_us(1000 * boot_ms, 1000 * self._boot_ms)
-        silent_ns, self._stamped_ns = arrived_ns - self._stamped_ns, arrived_ns
-        if back_us <= RESTART_STEP_US:
-            self._old_stamps, self._boot_ms = 0, boot_ms
+    def _watch_boot(self, boot_us: int, arrived_ns: int) -> None:
+        before_us = self._boot_order.newest_us
+        if boot_us == 0 or not self._boot_order.accepts(boot_us):
             return
-        if self._old_stamps == 0:
-            self._silent_ns = silent_ns
-        self._old_stamps += 1  # a single one is a late packet
-        has_run_longer = boot_ms * NS_PER_MS > _FASTEST_CLOCK * self._silent_ns + _BOOT_SLACK_NS
-        if self._old_stamps >= RESTART_STAMPS and has_run_longer:  # same flight, clock set back
-            self._old_stamps, self._boot_ms = 0, boot_ms
+        silent_ns, self._stamped_ns = arrived_ns - self._stamped_ns, arrived_ns
+        back_us = -later_by_us(boot_us, before_us)
+        if back_us <= RESTART_STEP_US:
+            return
+        if 1000 * boot_us > _FASTEST_CLOCK * silent_ns + _BOOT_SLACK_NS:  # its clock was set back
             reason = because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
             self.end_engagement(reason, arrived_ns)
+        else:
+            self.has_rebooted = True
 
     def step(self, now_ns: int) -> Iterator[Request]:
         """Yield the requests that are due."""
@@ -264,8 +252,8 @@ class VehicleSession:
         if (request := self._streams.step(now_ns)) is not None:
             yield request
         yield from self._streams.stand_ins(now_ns)
-        if self._receiver_due_ns is None and self._streams.is_settled:
-            self._receiver_due_ns = now_ns + RECEIVER_WAIT_NS
+        if self.condition.receiver_due_ns is None and self._streams.is_settled:
+            self.condition.receiver_due_ns = now_ns + RECEIVER_WAIT_NS
 
     def unfinished(self, now_ns: int) -> Reason | None:
         """Return the unfinished step of the set-up, or None."""
@@ -273,28 +261,19 @@ class VehicleSession:
             return because(Code.READING_PARAMETERS)
         if not self._streams.is_settled and self._streams.renewals == 0:
             return because(Code.REQUESTING_TELEMETRY)
-        if not self._is_receiver_settled(now_ns):
+        if not self.condition.is_receiver_settled(now_ns):
             return because(Code.LOOKING_FOR_RECEIVER)
         return None
 
-    def _is_receiver_settled(self, now_ns: int) -> bool:
-        """True if all messages that show a receiver have arrived, or the wait for them is over."""
-        due_ns = self._receiver_due_ns
-        return self.condition.has_seen_radio or (due_ns is not None and now_ns >= due_ns)
-
     def status(self, now_ns: int) -> VehicleStatus | None:
         """Return the vehicle's status; None before its first heartbeat."""
-        return self.condition.status(
-            now_ns,
-            is_receiver_settled=self._is_receiver_settled(now_ns),
-            ignores_receiver=self.params.ignores_receiver,
-        )
+        return self.condition.status(now_ns)
 
     def roles(self, status: VehicleStatus | None) -> ModeRoles:
         """Return the modes' roles; a receiver may follow our sticks without a failsafe."""
         roles = self.profile.modes.roles
         has_receiver = status is not None and status.has_receiver is True
-        if has_receiver and self.profile.falls_back(self.params.values):
+        if has_receiver and self.params.traits.falls_back:
             return replace(roles, is_silence_failsafe=False)
         return roles
 

@@ -72,7 +72,7 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
         context,
         ours,
         unusable,
-        profile.override_switch(values) if is_override else None,
+        profile.traits(values).override_switch if is_override else None,
         tuple(note.accepted() if note.risk in accepted else note for note in notes),
     )
 

@@ -108,6 +108,8 @@ class VehicleParams:
         self._reader.request(tuple(name for name, _ in config.set_params))
         self.values: Mapping[str, float] = self._reader.values
         """Relevant parameters received from the vehicle, by name."""
+        self.traits = profile.traits(self.values)
+        """What these parameters make of the vehicle."""
         self.changes = TemporaryParams(config.set_params, before=old_params, report=report)
         """Parameters that are set for the flight."""
         self._follow_ups: dict[CommandRequest, tuple[int, int]] = {}
@@ -127,11 +129,6 @@ class VehicleParams:
         """Number of the channel that enables the output, or None."""
         return self._assessed.override_switch if self._assessed else None
 
-    @property
-    def ignores_receiver(self) -> bool:
-        """True if the vehicle ignores a receiver's sticks."""
-        return self._profile.ignores_receiver(self.values)
-
     def use_output(self, output: Output) -> None:
         """Check the parameters for this output from now on."""
         self._context = self._context._replace(output=output)
@@ -150,6 +147,8 @@ class VehicleParams:
         self._reader.receive(param)
         if param.name in self.values:  # other names are unlimited
             self._kinds[param.name] = param.kind
+        if old != self.values.get(param.name):
+            self.traits = self._profile.traits(self.values)
         self.changes.receive(param)
         if not self.is_read or old == self.values.get(param.name):
             return

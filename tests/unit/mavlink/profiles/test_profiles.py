@@ -188,12 +188,8 @@ def test_a_switch_of_the_pilots_own_is_none_of_our_sticks(name: str, value: floa
 
 
 def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
-    assert [
-        ARDUPILOT.ignores_receiver({"RC_OPTIONS": bits}) for bits in (1.0, 33.0, 32.0, 2.0)
-    ] == [
-        *(True, True),
-        *(False, False),
-    ]
+    for bits, is_ignored in ((1.0, True), (33.0, True), (32.0, False), (2.0, False)):
+        assert ARDUPILOT.traits({"RC_OPTIONS": bits}).ignores_receiver is is_ignored
 
 
 @pytest.mark.parametrize(
@@ -207,9 +203,8 @@ def test_sticks_of_mavlink_must_be_taken_and_no_gesture_may_stop_the_motors(
         found = notes_of(PX4, {name: float(value)}, "manual-control")
         assert [note.cure for note in found] == [f"--set {name}={mended}"] * (value in refused)
         assert notes_of(PX4, {name: float(value)}, "rates") == []
-        assert PX4.ignores_receiver({name: float(value)}) == (
-            name == "COM_RC_IN_MODE" and value in (1, 4)
-        )
+        is_ignored = name == "COM_RC_IN_MODE" and value in (1, 4)
+        assert PX4.traits({name: float(value)}).ignores_receiver is is_ignored
 
 
 @pytest.mark.parametrize(
