@@ -319,15 +319,10 @@ class MavlinkLink:
             self._adopt(identity)
             return
         place, timeout_s = self._config.connect, self._config.connect_timeout_s
-        waited_s, heard = (now_ns - self._started_ns) / NS_PER_S, self._connection
+        waited_s = (now_ns - self._started_ns) / NS_PER_S
         if waited_s > timeout_s and not self._discovery.is_settling:
-            why = self._discovery.describe(
-                parse_address(place),
-                waited_s,
-                heard.received_bytes,
-                heard.received_packets,
-                heard.obstacles(now_ns),
-            )
+            address = parse_address(place)
+            why = self._discovery.describe(address, waited_s, self._connection, now_ns)
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:

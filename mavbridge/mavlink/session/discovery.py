@@ -1,6 +1,5 @@
 """Discovery of the vehicle to fly among all senders on the link."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -16,7 +15,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
-from mavbridge.mavlink.transport.connection import Address
+from mavbridge.mavlink.transport.connection import Address, Connection
 
 AUTOPILOT_COMPONENT = 1
 SETTLE_NS = 3 * NS_PER_S // 2
@@ -144,12 +143,7 @@ class VehicleDiscovery:
         return None
 
     def describe(
-        self,
-        address: LinkAddress,
-        waited_s: float,
-        received_bytes: int,
-        received_packets: int,
-        refusals: Iterable[str] = (),
+        self, address: LinkAddress, waited_s: float, connection: Connection, now_ns: int
     ) -> str:
         """Describe what was heard instead of the vehicle, with advice for this kind of link."""
         if self._heard_ns:
@@ -163,20 +157,20 @@ class VehicleDiscovery:
                 f"{AUTOPILOT_COMPONENT} is flown: set MAV_COMP_ID (PX4) to {AUTOPILOT_COMPONENT}, "
                 "or mend the router that changes it"
             )
-        if refused := "; ".join(refusals):
-            return refused
+        if refused := connection.obstacles(now_ns):
+            return "; ".join(refused)
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
                 "the vehicle's own port, or have the ground station forward it"
             )
-        amount = f"{received_bytes / 1000 / max(waited_s, 0.1):.1f} kB/s came"
-        if received_packets:
+        amount = f"{connection.received_bytes / 1000 / max(waited_s, 0.1):.1f} kB/s came"
+        if connection.received_packets:
             return (
                 f"{amount}, MAVLink without a heartbeat of any sender: the link loses most of it, "
                 "or a router filters HEARTBEAT"
             )
-        return _silence(address, amount if received_bytes else None)
+        return _silence(address, amount if connection.received_bytes else None)
 
 
 def _silence(address: LinkAddress, amount: str | None) -> str:

@@ -1,7 +1,10 @@
 """Newest reading of each quantity, from the best message that carries it."""
 
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Reading, Sample, Telemetry
+from mavbridge.core.vehicle import ForwardedPacket, Reading, Sample, Telemetry
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
@@ -50,8 +53,7 @@ class TelemetryCollector:
     """Combines messages into one ``Telemetry``."""
 
     def __init__(self) -> None:
-        self._attitude_filter, self._velocity_filter = _Filter(), _Filter()
-        self._force_filter, self._height_filter = _Filter(), _Filter()
+        self._filters: dict[type[Measurement], _Filter] = defaultdict(_Filter)
         self.telemetry = Telemetry()
         """Newest reading of each quantity."""
 
@@ -59,23 +61,22 @@ class TelemetryCollector:
         """Process a message with its arrival and measurement time; return its new samples."""
         rank, values = 0, {}
         if isinstance(body, Attitude):
-            rank, filtered = 0 if body.is_quaternion else 1, self._attitude_filter
+            rank = 0 if body.is_quaternion else 1
             values = {
                 "ned_from_body_wxyz": body.ned_from_body_wxyz,
                 "rate_body_radps": body.rate_body_radps,
             }
         elif isinstance(body, LocalVelocity):
-            filtered = self._velocity_filter
             values = {"velocity_ned_mps": body.velocity_ned_mps}
             if body.position_ned_m is not None:
                 values["position_ned_m"] = body.position_ned_m
         elif isinstance(body, Altitude):
-            filtered = self._height_filter
             values = {"height_above_home_m": (body.above_home_m,)}
         else:
-            rank, filtered = _FORCE_RANK[body.message_name], self._force_filter
+            rank = _FORCE_RANK[body.message_name]
             values = {"specific_force_body_mps2": body.specific_force_body_mps2}
-        delay_ns = filtered.delay_ns(rank, body.boot_us, arrived_ns, happened_ns)
+        newest = self._filters[type(body)]
+        delay_ns = newest.delay_ns(rank, body.boot_us, arrived_ns, happened_ns)
         if delay_ns is None:
             return ()
         new = {name: Reading(arrived_ns, each, delay_ns) for name, each in values.items()}
@@ -83,22 +84,15 @@ class TelemetryCollector:
         return tuple(map(Sample._make, new.items()))
 
 
-class PacketDecoder:
-    """Converts recorded packets to the samples that the guard took from the link."""
-
-    def __init__(self) -> None:
-        self._codec = Codec(source_system=0, source_component=0)
-        self._collector = TelemetryCollector()
-
-    @property
-    def telemetry(self) -> Telemetry:
-        """Newest reading of each quantity."""
-        return self._collector.telemetry
-
-    def decode(self, data: bytes, arrived_ns: int, happened_ns: int) -> tuple[Sample, ...]:
-        """Return the new samples of one datagram of the vehicle."""
+def samples_of(
+    packets: Iterable[ForwardedPacket],
+) -> Iterator[tuple[tuple[Sample, ...], Telemetry]]:
+    """Yield the samples that the guard took from recorded packets, and all readings after each."""
+    codec, collector = Codec(source_system=0, source_component=0), TelemetryCollector()
+    for arrived_ns, happened_ns, data in packets:
         samples: tuple[Sample, ...] = ()
-        for message in self._codec.decode_datagram(data):
+        for message in codec.decode_datagram(data):
             if isinstance(message.body, Measurement):
-                samples += self._collector.receive(message.body, arrived_ns, happened_ns)
-        return samples
+                samples += collector.receive(message.body, arrived_ns, happened_ns)
+        if samples:
+            yield samples, collector.telemetry

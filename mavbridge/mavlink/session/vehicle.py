@@ -195,10 +195,8 @@ class VehicleSession:
                 self._switch.read(channels_us[switch - 1] if in_range else 0, arrived_ns)
             case CommandAck():
                 self._streams.receive_ack(body)
-            case ParamValue():
+            case ParamValue() | ParamAbsent():
                 self.params.receive(body, self.status(arrived_ns))
-            case ParamAbsent(name):
-                self.params.absent(name)
             case AutopilotVersion(version):
                 self.version = version
                 self.params.use_version(version)

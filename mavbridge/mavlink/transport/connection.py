@@ -55,6 +55,9 @@ class TransportDownError(Exception):
 class Transport(Protocol):
     """Non-blocking connection to a vehicle; not thread-safe."""
 
+    refusal: str = ""
+    """Why the system refused the last packet; empty if it took it."""
+
     def open(self) -> None:
         """Open the socket or port; raise UserError, or TransportDownError if a retry may help."""
         return
@@ -76,10 +79,6 @@ class Transport(Protocol):
         ``peer``: destination of a datagram if we listen, else ignored. Raise TransportDownError if
         the connection is lost.
         """
-
-    def refusal(self) -> str:
-        """Return why the system refused the last packet; empty if it took it."""
-        return ""
 
     def close(self) -> None:
         """Close the socket or port; safe to call twice."""
@@ -214,7 +213,7 @@ class Connection:
         """Return why no vehicle is heard: the system refuses our packets, or we refuse its."""
         if self.received_bytes or not self.is_refused(now_ns):
             return self.refusals
-        if not (refusal := self._transport.refusal()):
+        if not (refusal := self._transport.refusal):
             return []
         where = "check the address, the network and the firewall"
         return [f"this computer refuses to send there ({refusal}): {where}"]

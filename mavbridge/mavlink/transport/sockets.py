@@ -115,7 +115,6 @@ class UdpTransport(_FileTransport[socket.socket]):
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
         super().__init__(f"udp {spelled(*address)}", clock)
         self._address, self._listen = address, listen
-        self._refusal = ""
 
     def open(self) -> None:
         """See `Transport`."""
@@ -166,18 +165,14 @@ class UdpTransport(_FileTransport[socket.socket]):
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one datagram to the peer, if there is one and it is reachable now."""
-        receiver, self._refusal = self.receiver(peer), ""
+        receiver, self.refusal = self.receiver(peer), ""
         if self._handle is not None and receiver is not None:
             try:
                 self._handle.sendto(data, receiver)
                 return True
             except OSError as error:  # full buffer, no route, no listener
-                self._refusal = error.strerror or ""
+                self.refusal = error.strerror or ""
         return False
-
-    def refusal(self) -> str:
-        """See `Transport`."""
-        return self._refusal
 
 
 class TcpTransport(_FileTransport[socket.socket]):

@@ -17,7 +17,7 @@ import numpy as np
 
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
-from mavbridge.core.vehicle import Sample, Telemetry
+from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import plan_flight
@@ -26,7 +26,7 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardStatus, GuardTick, Samples
-from mavbridge.mavlink.session.telemetry import PacketDecoder
+from mavbridge.mavlink.session.telemetry import samples_of
 from mavbridge.recording.rows import STATE_STAMPS
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
@@ -166,17 +166,18 @@ class _News:
     ) -> None:
         self._view = view
         self._shelves = shelves
-        decoder = PacketDecoder()
         self._samples: list[tuple[Sample, ...]] = []
         """Samples of each packet that contains any."""
         self._telemetry: list[Telemetry] = []
         """Telemetry after each entry of ``_samples``."""
-        for packet in source.packets:
-            if packet.happened_ns is None:
-                continue
-            if new := decoder.decode(packet.data, packet.arrived_ns, packet.happened_ns):
-                self._samples.append(new)
-                self._telemetry.append(decoder.telemetry)
+        flown = (
+            ForwardedPacket(arrived_ns, happened_ns, data)
+            for arrived_ns, happened_ns, data in source.packets
+            if happened_ns is not None
+        )
+        for samples, telemetry in samples_of(flown):
+            self._samples.append(samples)
+            self._telemetry.append(telemetry)
         self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
         self._reader = StateReader(recorded_plan(source))
         self._next = 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -137,8 +138,13 @@ def test_other_senders_are_described(
 
 def hearing(
     spec: str, received_bytes: int = 0, received_packets: int = 0
-) -> tuple[LinkAddress, float, int, int]:
-    return parse_address(spec), 5.0, received_bytes, received_packets
+) -> tuple[LinkAddress, float, Any, int]:
+    heard = SimpleNamespace(
+        obstacles=lambda _now_ns: [],
+        received_bytes=received_bytes,
+        received_packets=received_packets,
+    )
+    return parse_address(spec), 5.0, heard, 0
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,13 @@ from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
-from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
+from mavbridge.mavlink.codec.messages import (
+    CommandRequest,
+    ParamAbsent,
+    ParamRequest,
+    ParamValue,
+    ParamWrite,
+)
 from mavbridge.mavlink.profiles.profile import ParamContext, Profile, StreamGroup
 from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_risks
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
@@ -137,8 +143,11 @@ class VehicleParams:
         """Check the parameters for this version of the firmware from now on."""
         self._context = self._context._replace(version=version)
 
-    def receive(self, param: ParamValue, status: VehicleStatus | None) -> None:
-        """Process a PARAM_VALUE, requested or not."""
+    def receive(self, param: ParamValue | ParamAbsent, status: VehicleStatus | None) -> None:
+        """Process a PARAM_VALUE, requested or not, or note that a parameter does not exist."""
+        if isinstance(param, ParamAbsent):
+            self._reader.absent(param.name)
+            return
         if self._profile.is_bytewise:
             param = param.from_bytes()
         if not math.isfinite(param.value):
@@ -167,10 +176,6 @@ class VehicleParams:
             self.interruption = because(
                 Code.PARAMETER_CHANGED, name=param.name, before=old, after=param.value
             )
-
-    def absent(self, name: str) -> None:
-        """Note that the vehicle has no parameter of this name."""
-        self._reader.absent(name)
 
     def step(
         self, now_ns: int, status: VehicleStatus | None
