@@ -332,7 +332,7 @@ class MavlinkLink:
             self._config,
             old_params=self._old_params,
             report=self._report,
-            has_slow_clock=lambda: self._timesync.slow_pace is not None,
+            has_slow_clock=lambda: self._timesync.slow_clock is not None,
         )
         if self._watches_home_height:
             self.vehicle.watch_home_height()

@@ -144,28 +144,33 @@ class AttitudeOutput(SetpointOutput):
             self._scale = self._thrust_scale(vehicle)
         is_boosted = isinstance(action, BodyRates) and vehicle.params.traits.boosts_thrust
         boost = self._cos_tilt if is_boosted else 1.0
-        scale = self._scale * boost
         shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)
-        is_checked = shown[0] > 0  # leave idle motors idle
-        if is_checked and not self._shows_rates:
+        is_checked = shown[0] > 0 and not self._shows_rates  # leave idle motors idle
+        if is_checked:
             shown = self.echo.with_dither(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS
-        policy_thrust = thrust / scale
-        expected = self._expected(shown, vehicle, now_ns) if is_checked else None
+        action = action._replace(thrust=thrust / (self._scale * boost))
+        quaternion, rates = None, (0.0, 0.0, 0.0)
         if isinstance(action, BodyRates):
-            rates = action._replace(thrust=policy_thrust)
-            return self._encode_rates(rates, vehicle, thrust, expected, now_ns)
-        if self._measured_rad is None:
-            return None
-        if not self._follows(vehicle, now_ns):
             self._asked_rad = None
-        heading = self._next_heading_rad(self._measured_rad, action.yaw_rate_radps, now_ns)
-        quaternion = quaternion_from_euler(action.roll_rad, action.pitch_rad, heading)
+            roll, pitch, yaw = (round(rate * RATE_UNITS) for rate in action[1:])
+            if self._shows_rates:
+                shown, is_checked = self.echo.with_dither((roll, pitch, yaw), now_ns), True
+                roll, pitch, yaw = shown
+            rates = roll / RATE_UNITS, pitch / RATE_UNITS, yaw / RATE_UNITS
+            action = BodyRates(action.thrust, *rates)
+        elif self._measured_rad is None:
+            return None
+        else:
+            if not self._follows(vehicle, now_ns):
+                self._asked_rad = None
+            heading = self._next_heading_rad(self._measured_rad, action.yaw_rate_radps, now_ns)
+            quaternion = quaternion_from_euler(action.roll_rad, action.pitch_rad, heading)
         packet = self._codec.encode_attitude(
-            vehicle.identity.source, quaternion, (0.0, 0.0, 0.0), thrust, now_ns=now_ns
+            vehicle.identity.source, quaternion, rates, thrust, now_ns=now_ns
         )
-        flown = action._replace(thrust=policy_thrust)
-        return Encoded(packet, flown, None if self._shows_rates else expected)
+        expected = self._expected(shown, vehicle, now_ns) if is_checked else None
+        return Encoded(packet, action, expected)
 
     def _next_heading_rad(self, measured_rad: float, yaw_rate_radps: float, now_ns: int) -> float:
         """Return the heading to command now, in [-pi, pi]: a setpoint has no usable yaw rate.
@@ -179,25 +184,6 @@ class AttitudeOutput(SetpointOutput):
             lead_rad = min(max(lead_rad, -MOST_LEAD_RAD), MOST_LEAD_RAD)
         self._asked_rad, self._asked_ns = math.remainder(measured_rad + lead_rad, math.tau), now_ns
         return self._asked_rad
-
-    def _encode_rates(
-        self,
-        action: BodyRates,
-        vehicle: VehicleSession,
-        thrust: float,
-        shown: Shown | None,
-        now_ns: int,
-    ) -> Encoded:
-        self._asked_rad = None
-        rates = tuple(round(rate * RATE_UNITS) for rate in action[1:])
-        if self._shows_rates:
-            rates = self.echo.with_dither(rates, now_ns)
-            shown = self._expected(rates, vehicle, now_ns)
-        roll, pitch, yaw = (rate / RATE_UNITS for rate in rates)
-        packet = self._codec.encode_attitude(
-            vehicle.identity.source, None, (roll, pitch, yaw), thrust, now_ns=now_ns
-        )
-        return Encoded(packet, BodyRates(action.thrust, roll, pitch, yaw), shown)
 
     def _thrust_scale(self, vehicle: VehicleSession) -> float:
         hover = self._hover.value or vehicle.params.values.get(vehicle.profile.hover_param)

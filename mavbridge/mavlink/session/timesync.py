@@ -121,8 +121,8 @@ class TimesyncFilter:
             self._report(str(slow))
 
     @property
-    def slow_pace(self) -> float | None:
-        """Pace of the vehicle's clock relative to ours if below SLOW_PACE, else None."""
+    def slow_clock(self) -> Reason | None:
+        """Why the vehicle's stamps lag real time, by its pace relative to our clock, or None."""
         if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < _PACE_NS * 3 // 4:
             return None
         first, middle, last = (self._clocks[at] for at in (0, len(self._clocks) // 2, -1))
@@ -130,14 +130,9 @@ class TimesyncFilter:
             (end[1] - begin[1]) / (end[0] - begin[0]) if end[0] > begin[0] else 1.0
             for begin, end in ((first, middle), (middle, last))
         ]
-        is_slow = all(0 < half < SLOW_PACE for half in halves)
-        return (last[1] - first[1]) / (last[0] - first[0]) if is_slow else None
-
-    @property
-    def slow_clock(self) -> Reason | None:
-        """Why the vehicle's stamps lag real time, or None."""
-        pace = self.slow_pace
-        return None if pace is None else because(Code.SLOW_CLOCK, pace=pace)
+        if not all(0 < half < SLOW_PACE for half in halves):
+            return None
+        return because(Code.SLOW_CLOCK, pace=(last[1] - first[1]) / (last[0] - first[0]))
 
     @property
     def late_sending(self) -> Reason | None:
