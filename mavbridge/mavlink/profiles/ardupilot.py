@@ -16,8 +16,8 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     TURNED,
     ardupilot_curves,
     calibration,
-    calibration_names,
     is_simple_setting,
+    stick_names,
     stick_notes,
 )
 from mavbridge.mavlink.profiles.profile import (
@@ -136,10 +136,8 @@ class ArduPilot(Profile):
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Return the channels' parameters, and those that decide a flight's safety."""
-        channels = [int(values[n]) for stick in STICKS if (n := f"RCMAP_{stick}") in values]
-        more = (f"RC{number}_{part}" for number in channels for part in ("DZ", "OPTION"))
         thrust_names = ("GUID_OPTIONS", "ATC_ANGLE_BOOST", "MOT_THST_HOVER")
-        return (*calibration_names(values), *more, *SIMPLE_NAMES, *_RISK_NAMES, *thrust_names)
+        return (*stick_names(values, "OPTION"), *SIMPLE_NAMES, *_RISK_NAMES, *thrust_names)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """Return the calibration from RCMAP_* and RCn_*."""

@@ -35,7 +35,7 @@ SIMPLE_NAMES = ("SIMPLE", "SUPER_SIMPLE")
 _SIMPLE_OPTIONS = (3.0, 13.0)
 """RCn_OPTION "Simple Mode" and "Super Simple Mode"."""
 TURNED = "pitch and roll sticks count in the axes of "
-_CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
+_STICK_PARTS = ("MIN", "TRIM", "MAX", "REVERSED", "DZ")
 _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
 """Modes in which sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALT_HOLD"
@@ -73,7 +73,7 @@ def ardupilot_curves(
     lean = _present(values, "ATC_ANGLE_MAX", "ANGLE_MAX")
     up = _present(values, "PILOT_SPD_UP", "PILOT_SPEED_UP")
     down = _present(values, "PILOT_SPD_DN", "PILOT_SPEED_DN")
-    needed = (lean, "PILOT_Y_RATE", up, down, "THR_DZ", *_curve_names(values))
+    needed = (lean, "PILOT_Y_RATE", up, down, "THR_DZ", *stick_names(values))
     if (
         nothing := unusable(values, needed=needed, positive=(lean, "PILOT_Y_RATE", up))
     ) is not None:
@@ -98,17 +98,6 @@ def ardupilot_curves(
 def _present(values: Mapping[str, float], new: str, old: str) -> str:
     """Return the name that this firmware has sent; the old one if it has sent neither."""
     return new if new in values else old
-
-
-def _curve_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the parameters that define the dead zones, as far as RCMAP_* is known."""
-    names: tuple[str, ...] = ()
-    for stick in STICKS:
-        names += (f"RCMAP_{stick}",)
-        if (number := values.get(f"RCMAP_{stick}")) is not None:
-            parts = ("MIN", "MAX", "DZ", *(() if stick == "THROTTLE" else ("TRIM", "REVERSED")))
-            names += tuple(f"RC{int(number)}_{part}" for part in parts)
-    return names
 
 
 def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -> Axis:
@@ -142,11 +131,15 @@ def _throttle(values: Mapping[str, float], up: str, down: str) -> Axis:
     )
 
 
-def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the parameters needed to map sticks to channels, as far as RCMAP_* is known."""
+def stick_names(values: Mapping[str, float], *parts: str) -> tuple[str, ...]:
+    """Return the parameters that map sticks to channels, as far as RCMAP_* is known.
+
+    ``parts``: more suffixes of RCn_ for each of these channels.
+    """
     names = tuple(f"RCMAP_{stick}" for stick in STICKS)
     numbers = sorted({int(values[name]) for name in names if name in values})
-    return names + tuple(f"RC{number}_{part}" for number in numbers for part in _CALIBRATION_PARTS)
+    suffixes = (*_STICK_PARTS, *parts)
+    return names + tuple(f"RC{number}_{suffix}" for number in numbers for suffix in suffixes)
 
 
 def calibration(values: Mapping[str, float]) -> RcCalibration:
