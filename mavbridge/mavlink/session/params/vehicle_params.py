@@ -1,7 +1,7 @@
 """Parameters of one vehicle: known values, demands of the flight, and changes for it."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.link_settings import LinkSettings
@@ -23,62 +23,6 @@ _WINDOW = 16
 """Requests in flight at once; ArduPilot queues twenty."""
 _TIMEOUT_NS = 300 * NS_PER_MS
 _ATTEMPTS = 4
-
-
-class ParamReader:
-    """Reads a list of parameters by name, a few at a time, and repeats lost requests."""
-
-    def __init__(self, names: tuple[str, ...], *, known: frozenset[str] | None = None) -> None:
-        self._known = known
-        """Names that may be requested; None: any."""
-        self._open: dict[str, tuple[int, int]] = {}
-        """Time of the last request and number of requests, by name."""
-        self._names: set[str] = set()
-        self.values: dict[str, float] = {}
-        """Received values."""
-        self.request(names)
-
-    def request(self, names: tuple[str, ...]) -> None:
-        """Add these parameters, including ones that were given up before."""
-        if self._known is not None:
-            names = tuple(name for name in names if name in self._known)
-        missing = [name for name in names if name not in self.values]
-        self._open |= {name: (0, 0) for name in missing if name not in self._open}
-        self._names |= set(names)
-
-    @property
-    def is_done(self) -> bool:
-        """True if every parameter has arrived or was given up."""
-        return not self._open
-
-    def receive(self, param: ParamValue) -> None:
-        """Process a PARAM_VALUE, requested by anyone; store it if it is in the list."""
-        self._open.pop(param.name, None)
-        if param.name in self._names:
-            self.values[param.name] = param.value
-
-    def absent(self, name: str) -> None:
-        """Give up on a parameter that the vehicle does not have."""
-        self._open.pop(name, None)
-
-    def step(self, now_ns: int) -> Iterator[ParamRequest]:
-        """Yield the requests that are due: repetitions first, then new ones up to the window."""
-        in_flight = sum(attempts > 0 for _, attempts in self._open.values())
-        for name, (requested_ns, attempts) in list(self._open.items()):
-            if attempts == 0:
-                if in_flight >= _WINDOW:
-                    continue
-                in_flight += 1
-            elif now_ns - requested_ns < _TIMEOUT_NS:
-                continue
-            elif attempts >= _ATTEMPTS:
-                del self._open[name]
-                in_flight -= 1
-                continue
-            self._open[name] = (now_ns, attempts + 1)
-            yield ParamRequest(name)
-
-
 _AGAIN_NS = 2 * NS_PER_S
 """Time between attempts to read parameters that the vehicle did not send."""
 _FOLLOW_UPS = 3
@@ -107,13 +51,15 @@ class VehicleParams:
         self._report = report
         risks, port = config.accepted_risks, serial_risks(config, streams)
         self._context = ParamContext(None, config.source_system, None, None, risks, port)
-        self._reader = ParamReader(profile.params, known=config.known_params)
+        self._open: dict[str, tuple[int, int]] = {}
+        """Time of the last request and number of requests, by name of a parameter to read."""
+        self._relevant: set[str] = set()
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
         self._again_ns = 0
-        self._reader.request(tuple(name for name, _ in config.set_params))
-        self.values: Mapping[str, float] = self._reader.values
+        self.values: dict[str, float] = {}
         """Relevant parameters received from the vehicle, by name."""
+        self._read((*profile.params, *(name for name, _ in config.set_params)))
         self.traits = profile.traits(self.values)
         """What these parameters make of the vehicle."""
         self.changes = TemporaryParams(config.set_params, before=old_params, report=report)
@@ -146,20 +92,20 @@ class VehicleParams:
     def receive(self, param: ParamValue | ParamAbsent, status: VehicleStatus | None) -> None:
         """Process a PARAM_VALUE, requested or not, or note that a parameter does not exist."""
         if isinstance(param, ParamAbsent):
-            self._reader.absent(param.name)
+            self._open.pop(param.name, None)
             return
         if self._profile.is_bytewise:
             param = param.from_bytes()
         if not math.isfinite(param.value):
             return
-        old = self.values.get(param.name)
-        self._reader.receive(param)
-        if param.name in self.values:  # other names are unlimited
-            self._kinds[param.name] = param.kind
-        if old != self.values.get(param.name):
-            self.traits = self._profile.traits(self.values)
+        self._open.pop(param.name, None)
         self.changes.receive(param)
-        if not self.is_read or old == self.values.get(param.name):
+        old = self.values.get(param.name)
+        if param.name not in self._relevant or param.value == old:
+            return
+        self.values[param.name], self._kinds[param.name] = param.value, param.kind
+        self.traits = self._profile.traits(self.values)
+        if not self.is_read:
             return
         if (
             old is not None
@@ -181,17 +127,17 @@ class VehicleParams:
         self, now_ns: int, status: VehicleStatus | None
     ) -> Iterator[ParamRequest | ParamWrite | CommandRequest]:
         """Yield the requests that are due."""
-        yield from self._reader.step(now_ns)
-        if self._reader.is_done:
+        yield from self._read_requests(now_ns)
+        if not self._open:
             self._ask_for_missing(now_ns, status)
-        if self._reader.is_done:
+        if not self._open:
             self._take_in(status)
             self._advise(status)
         if self.is_read:
             for request in self.changes.step(
                 now_ns,
                 self.values,
-                is_complete=self._reader.is_done,
+                is_complete=not self._open,
                 is_disarmed=status is not None and not status.armed,
             ):
                 yield self._as_written(request)
@@ -199,6 +145,32 @@ class VehicleParams:
             if left and now_ns >= due_ns:
                 self._follow_ups[command] = (left - 1, now_ns + NS_PER_S)
                 yield command
+
+    def _read(self, names: tuple[str, ...]) -> None:
+        """Read these parameters if they are unknown, including ones that were given up before."""
+        known = self._config.known_params
+        if known is not None:
+            names = tuple(name for name in names if name in known)
+        missing = [name for name in names if name not in self.values]
+        self._open |= {name: (0, 0) for name in missing if name not in self._open}
+        self._relevant |= set(names)
+
+    def _read_requests(self, now_ns: int) -> Iterator[ParamRequest]:
+        """Yield the requests that are due: repetitions first, then new ones up to the window."""
+        in_flight = sum(attempts > 0 for _, attempts in self._open.values())
+        for name, (requested_ns, attempts) in list(self._open.items()):
+            if attempts == 0:
+                if in_flight >= _WINDOW:
+                    continue
+                in_flight += 1
+            elif now_ns - requested_ns < _TIMEOUT_NS:
+                continue
+            elif attempts >= _ATTEMPTS:
+                del self._open[name]
+                in_flight -= 1
+                continue
+            self._open[name] = (now_ns, attempts + 1)
+            yield ParamRequest(name)
 
     def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
         """Return a write with the type that the firmware demands, if any."""
@@ -213,7 +185,7 @@ class VehicleParams:
         if now_ns < self._again_ns or is_flying:
             return
         self._again_ns = now_ns + _AGAIN_NS
-        self._reader.request(self._profile.needed_params(self.values))
+        self._read(self._profile.needed_params(self.values))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
