@@ -187,40 +187,10 @@ _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
 pilot's hand, which ends the mode."""
 _HELD_NS = 700 * NS_PER_MS
 """Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling."""
-
-
 _SPEED_TAU_S = 0.1
 """Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
 """Fraction of a hand's speed that counts as rest; also covers a jump that PX4 sees 70 ms late."""
-
-
-class StickSpeeds:
-    """Speed of the sent sticks, computed as in PX4's detector of a pilot's hand."""
-
-    def __init__(self) -> None:
-        self._last: ManualControl | None = None
-        self._at_ns = 0
-        self._per_s: tuple[float, ...] = (0.0,) * 4
-
-    @property
-    def fastest_per_s(self) -> float:
-        """Speed of the fastest stick [full sticks/s]."""
-        return max(map(abs, self._per_s))
-
-    def sent(self, values: ManualControl, now_ns: int) -> None:
-        """Add sticks that were sent."""
-        last, dt_s = self._last, (now_ns - self._at_ns) / NS_PER_S
-        self._last, self._at_ns = values, now_ns
-        if last is None or dt_s <= 0.0:
-            return
-        x, y, z, r = (value - before for value, before in zip(values, last, strict=True))
-        weight = dt_s / (_SPEED_TAU_S + dt_s)
-        moves = (x, y, 2 * z, r)  # z has half the range
-        self._per_s = tuple(
-            speed + weight * (move / STICK_END / dt_s - speed)
-            for speed, move in zip(self._per_s, moves, strict=True)
-        )
 
 
 class ManualControlOutput(StickOutput):
@@ -235,23 +205,35 @@ class ManualControlOutput(StickOutput):
 
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
         super().__init__(codec, MANUAL_ECHO, gains)
-        self._last = ManualControl(0, 0, STICK_END // 2, 0)
+        self._last: Shown = (0, 0, STICK_END // 2, 0)
+        """Last x, y, z, r that were sent, at ``_sent_ns``."""
         self._sent_ns = 0
-        self._speeds = StickSpeeds()
+        self._speeds_per_s: tuple[float, ...] = (0.0,) * 4
+        """Speeds of the sent sticks [full sticks/s], as in PX4's detector of a pilot's hand."""
         self._shown: tuple[int, Sticks] | None = None
         """Arrival of the sticks that the vehicle acts on, and those sticks."""
         self._pilot: Sticks | None = None
         """Sticks that the vehicle acted on when they were not ours."""
 
     def sent(self, encoded: Encoded, now_ns: int) -> None:
-        """Note sticks that were sent."""
+        """Note sticks that were sent, and their speeds."""
         super().sent(encoded, now_ns)
-        self._sent_ns = now_ns
-        self._speeds.sent(self._last, now_ns)
+        last, dt_s = self._last, (now_ns - self._sent_ns) / NS_PER_S
+        self._last, self._sent_ns = encoded.shown or last, now_ns
+        if dt_s <= 0.0:
+            return
+        x, y, z, r = (value - before for value, before in zip(self._last, last, strict=True))
+        weight = dt_s / (_SPEED_TAU_S + dt_s)
+        moves = (x, y, 2 * z, r)  # z has half the range
+        self._speeds_per_s = tuple(
+            speed + weight * (move / STICK_END / dt_s - speed)
+            for speed, move in zip(self._speeds_per_s, moves, strict=True)
+        )
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
         """True if our sticks are slower than a hand, by this firmware version's parameter."""
-        return self._speeds.fastest_per_s < _REST_SHARE * vehicle.params.traits.hand_per_s
+        fastest_per_s = max(map(abs, self._speeds_per_s))
+        return fastest_per_s < _REST_SHARE * vehicle.params.traits.hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the four sticks, rounded."""
@@ -260,7 +242,6 @@ class ManualControlOutput(StickOutput):
         x, y, z, r = shown
         values = ManualControl(x, y, z, r)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
-        self._last = values
         return Encoded(packet, curves.to_policy(values.sticks), shown, saturated)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
@@ -296,7 +277,7 @@ class ManualControlOutput(StickOutput):
         status = vehicle.status(now_ns) or self._status
         if status is None or status.mode not in _MODES:
             return None
-        z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
+        z = self._last[2] if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
         return self._codec.encode_manual_control(
             vehicle.identity.source.system, ManualControl(0, 0, z, 0)
         )
