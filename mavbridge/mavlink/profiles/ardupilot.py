@@ -86,6 +86,7 @@ _MODES = ModeTable(
     _MODE_NAMES,
     {name: (number, 0) for number, name in _MODE_NAMES.items()},
     roles=ModeRoles(
+        names=tuple(_MODE_NAMES.values()),
         hold="BRAKE",
         land="LAND",
         rtl="RTL",

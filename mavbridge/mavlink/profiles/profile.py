@@ -3,7 +3,6 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -16,30 +15,21 @@ from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
 
-class ModeTable:
-    """Names and numbers of flight modes.
+class ModeTable(NamedTuple):
+    """Names and numbers of flight modes."""
 
-    ``names``: name of each HEARTBEAT.custom_mode. ``main_mask``: its bits without the sub-mode; a
-    sub-mode without a name has that of its main mode. ``commands``: parameters 2 and 3 of
-    MAV_CMD_DO_SET_MODE, by name.
-    """
-
-    def __init__(
-        self,
-        names: Mapping[int, str],
-        commands: Mapping[str, tuple[int, int]],
-        *,
-        roles: ModeRoles,
-        main_mask: int = -1,
-    ) -> None:
-        self._names, self._commands, self._main_mask = names, commands, main_mask
-        self.roles = replace(roles, names=tuple(commands))
-        """Roles of the modes, and the names of all that can be requested."""
+    names: Mapping[int, str]
+    """Name of each HEARTBEAT.custom_mode."""
+    commands: Mapping[str, tuple[int, int]]
+    """Parameters 2 and 3 of MAV_CMD_DO_SET_MODE, by name."""
+    roles: ModeRoles
+    main_mask: int = -1
+    """Bits without the sub-mode; a sub-mode without a name has that of its main mode."""
 
     def name(self, custom_mode: int) -> str:
         """Return the name of HEARTBEAT.custom_mode, or its number if it has none."""
-        main = self._names.get(custom_mode & self._main_mask, str(custom_mode))
-        return self._names.get(custom_mode, main)
+        main = self.names.get(custom_mode & self.main_mask, str(custom_mode))
+        return self.names.get(custom_mode, main)
 
     def command(self, name: str) -> CommandRequest:
         """Return the request for a mode.
@@ -47,11 +37,10 @@ class ModeTable:
         Raises:
             UserError: the vehicle has no such mode.
         """
-        numbers = self._commands.get(name.upper())
+        numbers = self.commands.get(name.upper())
         if numbers is None:
-            raise UserError(
-                f"this vehicle has no mode {name!r}; it has {', '.join(sorted(self._commands))}"
-            )
+            known = ", ".join(sorted(self.commands))
+            raise UserError(f"this vehicle has no mode {name!r}; it has {known}")
         flag = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         return CommandRequest(dialect.MAV_CMD_DO_SET_MODE, (flag, *numbers))
 

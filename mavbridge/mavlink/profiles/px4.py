@@ -88,6 +88,7 @@ _MODES = ModeTable(
     _COMMANDS,
     main_mask=0xFF << 16,
     roles=ModeRoles(
+        names=tuple(_COMMANDS),
         hold="AUTO.LOITER",
         land="AUTO.LAND",
         rtl="AUTO.RTL",
