@@ -74,18 +74,14 @@ class _Stream:
         elif self.group.stream is not None:
             self._at = len(self._options) - 1
 
-    def share(self, span_s: float) -> float:
-        """Return the arrival rate as a fraction of the granted rate."""
-        return self._count / (self.rate_hz * span_s)
-
-    @property
-    def _count(self) -> int:
-        return max(self.received.values(), default=0)
+    def arriving_hz(self, span_s: float) -> float:
+        """Return the arrival rate of the group's most frequent message."""
+        return max(self.received.values(), default=0) / span_s
 
     def is_slow(self, span_s: float) -> bool:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
-        return not self.is_given_up and self._count <= least_hz * span_s
+        return not self.is_given_up and self.arriving_hz(span_s) <= least_hz
 
 
 def _options(group: StreamGroup) -> list[tuple[Request, float]]:
@@ -231,8 +227,8 @@ class StreamRequester:
 
     def _common_share(self, span_s: float) -> float | None:
         """Return the common rate fraction of all required streams, if a full link explains it."""
-        needed = [stream.share(span_s) for stream in self._streams if stream.group.is_needed]
-        shares = [share for share in needed if share > 0]  # no estimate, no messages
+        needed = [stream for stream in self._streams if stream.group.is_needed and stream.received]
+        shares = [stream.arriving_hz(span_s) / stream.rate_hz for stream in needed]
         if len(shares) < 2:
             return None
         mean = sum(shares) / len(shares)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
@@ -17,15 +18,15 @@ def is_same(one: float, other: float) -> bool:
     return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
 
 
+@dataclass(slots=True)
 class _Write:
     """Write of one parameter until the vehicle confirms it, with at most six requests."""
 
-    def __init__(self, value: float) -> None:
-        self.value = value
-        self.answer: float | None = None
-        """Value that the vehicle reported last, perhaps in answer to an older request."""
-        self.requested_ns = 0
-        self.attempts = 0
+    value: float
+    answer: float | None = None
+    """Value that the vehicle reported last, perhaps in answer to an older request."""
+    requested_ns: int = 0
+    attempts: int = 0
 
     @property
     def is_confirmed(self) -> bool:
@@ -82,6 +83,7 @@ class TemporaryParams:
     ) -> Iterator[ParamWrite | ParamRequest]:
         """Yield the requests that are due.
 
+        A repetition also reads the value: a vehicle that has it already may not answer a write.
         ``values``: all values received from the vehicle; ``is_complete``: no more will arrive.
         """
         self._is_disarmed = is_disarmed
@@ -91,29 +93,19 @@ class TemporaryParams:
             self._open = self._begin_writing(values)
         if not self._open:
             return
-        for name in [name for name, write in self._open.items() if write.is_confirmed]:
-            self._conclude(name, self._open.pop(name))
-        if is_disarmed:
-            yield from self._write(self._open, now_ns)
-        elif self._is_restoring and self._open:
+        for name, write in list(self._open.items()):
+            is_waiting = write.attempts > 0 and now_ns - write.requested_ns < _TIMEOUT_NS
+            is_due = is_disarmed and not is_waiting
+            if write.is_confirmed or (is_due and write.attempts >= _ATTEMPTS):
+                self._conclude(name, self._open.pop(name))
+            elif is_due:
+                write.requested_ns, write.attempts = now_ns, write.attempts + 1
+                yield ParamWrite(name, write.value)
+                if write.attempts > 1:
+                    yield ParamRequest(name)
+        if self._is_restoring and self._open and not is_disarmed:
             self._open.clear()
             self._report_what_stays()
-
-    def _write(self, writes: dict[str, _Write], now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
-        """Yield the write requests that are due.
-
-        A repetition also reads the value: a vehicle that has it already may not answer a write.
-        """
-        for name, write in list(writes.items()):
-            if write.attempts and now_ns - write.requested_ns < _TIMEOUT_NS:
-                continue
-            if write.attempts >= _ATTEMPTS:
-                self._conclude(name, writes.pop(name))
-                continue
-            write.requested_ns, write.attempts = now_ns, write.attempts + 1
-            yield ParamWrite(name, write.value)
-            if write.attempts > 1:
-                yield ParamRequest(name)
 
     def _begin_writing(self, values: Mapping[str, float]) -> dict[str, _Write]:
         writes = {}
