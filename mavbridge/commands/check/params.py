@@ -49,7 +49,7 @@ class Terms:
         """Output, system id, receiver, accepted risks and serial port of the flight."""
         link = self.config.link
         kind: ActionKind = "sticks" if self.contract is None else self.contract.action
-        output = self.profile.outputs[kind] if link.output == "auto" else link.output
+        output = self.profile.usual_output(kind) if link.output == "auto" else link.output
         serial = serial_risks(self.settings, self.streams)
         return ParamContext(
             output,

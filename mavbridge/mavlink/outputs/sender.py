@@ -43,15 +43,15 @@ def choose_output(
     Raises:
         PeerError: the output does not fit the vehicle or the actions.
     """
-    usual = profile.outputs[meaning.kind]
+    usual = profile.usual_output(meaning.kind)
     name = wanted or usual
     if CARRIED[name] != meaning.kind:
         raise PeerError(
             f"--output {name} carries {CARRIED[name]}, and the actions of this policy are "
             f"{meaning.kind}: use --output auto, which is {usual} here"
         )
-    if (refusal := profile.refusals.get(name)) is not None:
-        raise PeerError(refusal)
+    if name != usual:
+        raise PeerError(profile.refusal)
     match name:
         case "rc-override":
             return OverrideOutput(codec, meaning.stick_gains)

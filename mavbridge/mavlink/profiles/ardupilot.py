@@ -6,7 +6,7 @@ from typing import ClassVar
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
+from mavbridge.core.vehicle import ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.ardupilot_sticks import (
@@ -102,15 +102,8 @@ class ArduPilot(Profile):
 
     name = "ardupilot"
     modes = _MODES
-    outputs: ClassVar[Mapping[ActionKind, Output]] = {
-        "sticks": "rc-override",
-        "rates": "rates",
-        "attitude": "attitude",
-        "velocity": "velocity",
-    }
-    refusals: ClassVar[Mapping[Output, str]] = {
-        "manual-control": "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
-    }
+    stick_output: ClassVar[Output] = "rc-override"
+    refusal = "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
     params = _FIRST_NAMES
     target_hz = 50.0
     stick_echo = StreamGroup(

@@ -206,10 +206,9 @@ class Profile(ABC):
     name: ClassVar[str]
     """Name in settings and reports."""
     modes: ClassVar[ModeTable]
-    outputs: ClassVar[Mapping[ActionKind, Output]]
-    """Default output of each action kind."""
-    refusals: ClassVar[Mapping[Output, str]]
-    """Unsupported outputs, each with a sentence that says why and names an alternative."""
+    stick_output: ClassVar[Output]
+    refusal: ClassVar[str]
+    """Sentence that says why the other output for sticks is unsupported and names this one."""
     heartbeat_type: ClassVar[int] = dialect.MAV_TYPE_ONBOARD_CONTROLLER
     """MAV_TYPE of our HEARTBEAT to a vehicle of this firmware."""
     is_bytewise: ClassVar[bool] = False
@@ -237,6 +236,10 @@ class Profile(ABC):
 
         ``pilot_hz``: rate of RC_CHANNELS; None: the default.
         """
+
+    def usual_output(self, kind: ActionKind) -> Output:
+        """Return the default output of an action kind; setpoints have one of the same name."""
+        return self.stick_output if kind == "sticks" else kind
 
     def echo(self, output: Output) -> StreamGroup:
         """Return the message that shows the echo of this output.

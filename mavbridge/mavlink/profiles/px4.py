@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
+from mavbridge.core.vehicle import ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
@@ -163,15 +163,8 @@ class Px4(Profile):
 
     name = "px4"
     modes = _MODES
-    outputs: ClassVar[Mapping[ActionKind, Output]] = {
-        "sticks": "manual-control",
-        "rates": "rates",
-        "attitude": "attitude",
-        "velocity": "velocity",
-    }
-    refusals: ClassVar[Mapping[Output, str]] = {
-        "rc-override": "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
-    }
+    stick_output: ClassVar[Output] = "manual-control"
+    refusal = "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
     heartbeat_type = dialect.MAV_TYPE_GCS
     """PX4 sends STATUSTEXT only on links with a ground station."""
     is_bytewise = True

@@ -291,9 +291,7 @@ class VehicleSession:
 
     def output_problem(self, now_ns: int) -> Reason | None:
         """Return why the vehicle cannot be flown now with the chosen output, or None."""
-        if (forbidden := self.params.output_problem(self.status(now_ns))) is not None:
-            return forbidden
-        return self.switch_problem
+        return self.params.output_problem(self.status(now_ns)) or self.switch_problem
 
     @property
     def switch_problem(self) -> Reason | None:
