@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -121,25 +122,23 @@ class MavlinkLink:
     def snapshot(self) -> LinkSnapshot:
         """Return what the link knows now."""
         now_ns = self._clock.now_ns()
-        texts = self._connection.take_texts()
         vehicle, output = self.vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
         modes = vehicle.roles(status) if vehicle else ModeRoles()
         problem = self._problem(now_ns)
+        snapshot = partial(
+            LinkSnapshot,
+            telemetry=self._telemetry.telemetry,
+            interruption=self._interruption,
+            interruptions=self._interruptions,
+            texts=self._connection.take_texts(),
+        )
         if vehicle is None or output is None:
-            return LinkSnapshot(
-                telemetry=self._telemetry.telemetry,
-                status=status,
-                problem=problem or because(Code.NO_POLICY_LOADED),
-                interruption=self._interruption,
-                interruptions=self._interruptions,
-                modes=modes,
-                texts=texts,
-            )
+            problem = problem or because(Code.NO_POLICY_LOADED)
+            return snapshot(status=status, problem=problem, modes=modes)
         # A vehicle that receives nothing from us may follow another source.
         others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
-        return LinkSnapshot(
-            telemetry=self._telemetry.telemetry,
+        return snapshot(
             status=output.in_policy_terms(status, vehicle, now_ns),
             problem=problem or others or output.unheard(now_ns),
             is_overruled=others is not None,
@@ -148,11 +147,8 @@ class MavlinkLink:
             is_released=output.is_released(vehicle, now_ns),
             shows_last=output.shows_last,
             are_sticks_at_rest=output.are_sticks_at_rest(vehicle),
-            interruption=self._interruption,
-            interruptions=self._interruptions,
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self.commands.refused_mode,
-            texts=texts,
         )
 
     def _problem(self, now_ns: int) -> Reason | None:

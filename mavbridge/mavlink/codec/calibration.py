@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 from mavbridge.core.vehicle import Sticks
 
-Pwm: TypeAlias = tuple[int, int, int, int]
+Pwm: TypeAlias = tuple[int, ...]
 """Throttle, yaw, pitch, roll [us]."""
 
 PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
@@ -110,16 +110,15 @@ class RcCalibration:
 
     def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm:
         """Return the PWM of the four sticks among at least eight channels."""
-        t, y, p, r = (channels_us[channel.number - 1] for channel in self.channels)
-        return t, y, p, r
+        return tuple(channels_us[channel.number - 1] for channel in self.channels)
 
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
         """Return the PWM of throttle, yaw, pitch, roll, within the calibrated range."""
-        throttle, yaw, pitch, roll = (
+        throttle, *others = (
             channel.to_us(stick * sign, centre_us=centre_us)
             for stick, (channel, sign, centre_us) in zip(sticks, self._mapping, strict=True)
         )
-        return max(throttle, self.throttle_floor_us), yaw, pitch, roll
+        return (max(throttle, self.throttle_floor_us), *others)
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:
         """Return the sticks for these PWM values."""

@@ -128,12 +128,10 @@ class OverrideOutput(StickOutput):
         calibration = vehicle.params.calibration
         if calibration is None:
             return None
-        shown = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
-        throttle, yaw, pitch, roll = shown
-        pwm_us = (throttle, yaw, pitch, roll)
+        pwm_us = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         self._calibration, self._last = calibration, pwm_us
-        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown, saturated)
+        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), pwm_us, saturated)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS with the sent override."""
@@ -154,10 +152,9 @@ class OverrideOutput(StickOutput):
         is_brought_down = status.is_failsafe and status.mode in (roles.hold, roles.land, roles.rtl)
         if status.has_receiver or is_brought_down:
             return None
-        throttle, yaw, pitch, roll = pwm_of(NEUTRAL, calibration)
+        pwm_us = pwm_of(NEUTRAL, calibration)
         if status.mode in roles.thrust:
-            throttle = self._last[0]
-        pwm_us = (throttle, yaw, pitch, roll)
+            pwm_us = (self._last[0], *pwm_us[1:])
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         return Encoded(packet, calibration.to_sticks(pwm_us), pwm_us)
 
@@ -239,8 +236,7 @@ class ManualControlOutput(StickOutput):
         """Encode the four sticks, rounded."""
         sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
         shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
-        x, y, z, r = shown
-        values = ManualControl(x, y, z, r)
+        values = ManualControl._make(shown)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
         return Encoded(packet, curves.to_policy(values.sticks), shown, saturated)
 
