@@ -145,7 +145,8 @@ class MavlinkLink:
             is_switched_off=output.is_sticks and vehicle.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),
-            shows_last=output.shows_last,
+            # The echo of a setpoint tells nothing about a release.
+            shows_last=output.is_sticks and output.echo.shows_last,
             are_sticks_at_rest=output.are_sticks_at_rest(vehicle),
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self.commands.refused_mode,

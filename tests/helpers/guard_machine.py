@@ -250,7 +250,7 @@ class GuardWorld:
             is_switched_off=output.is_sticks and self.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),
-            shows_last=output.shows_last,
+            shows_last=output.is_sticks and output.echo.shows_last,
             interruption=self.interruption,
             interruptions=self.interruptions,
             modes=roles if output.is_sticks else replace(roles, is_silence_failsafe=False),

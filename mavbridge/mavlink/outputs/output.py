@@ -34,8 +34,6 @@ class ActionOutput(ABC):
     name: Output
     is_sticks: ClassVar[bool]
     """True if the actions are sticks, False if they are setpoints."""
-    hides_receiver: ClassVar[bool] = False
-    """True if RC_CHANNELS shows our sticks in place of the receiver's."""
     releases: ClassVar[int]
     """Number of packets that release the last action; 0: silence is the release."""
     _echo_message: ClassVar[str]
@@ -49,6 +47,8 @@ class ActionOutput(ABC):
         """Number of messages, by stick, that demanded more than the vehicle can do."""
         self.was_confirmed = False
         """True if the vehicle has ever been seen to act on our packets."""
+        self._is_checked = True
+        """False while no echo is to be expected."""
 
     def restart(self) -> None:
         """Start a new session of the vehicle, in which nothing was sent or seen."""
@@ -72,9 +72,6 @@ class ActionOutput(ABC):
         """Process a message of the vehicle, possibly an echo, before the session does."""
         self._compare(body, vehicle, arrived_ns)
         self.was_confirmed |= self.echo.confirmed
-        if self.hides_receiver:
-            vehicle.condition.is_receiver_hidden = self.echo.has_sent
-            vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
 
     @abstractmethod
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
@@ -84,9 +81,9 @@ class ActionOutput(ABC):
         """Return sticks to send before the first release, or None."""
         return None
 
-    @abstractmethod
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Encode one of the ``releases``; return None if there is nothing to release."""
+        return None
 
     def released(self) -> None:
         """Note that nothing more is sent until the next action."""
@@ -95,7 +92,7 @@ class ActionOutput(ABC):
     @property
     def echo_confirmed(self) -> bool:
         """True if the vehicle was seen to act on our packets, or shows no echo now."""
-        return self.echo.confirmed
+        return self.echo.confirmed or not self._is_checked
 
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
@@ -106,11 +103,6 @@ class ActionOutput(ABC):
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
         """True if the vehicle acts on something other than our last packets, or none were sent."""
         return self.echo.is_released
-
-    @property
-    def shows_last(self) -> bool:
-        """True if the vehicle shows our last command since the release, or values like it."""
-        return self.echo.shows_last
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
         """True if the vehicle does not take our last sticks for a pilot's hand."""

@@ -74,26 +74,12 @@ class SetpointOutput(ActionOutput):
         super().released()
         self._is_checked = False
 
-    @property
-    def echo_confirmed(self) -> bool:
-        """True if the vehicle has shown our target, or shows no echo now."""
-        return self.echo.confirmed or not self._is_checked
-
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
         """True if another mode has taken over, or the vehicle's own setpoint timeout has passed."""
         if self._sent_ns is None:
             return True
         is_over = now_ns - self._sent_ns > HELD_NS
         return not self.echo.is_sending and (is_over or not self._follows(vehicle, now_ns))
-
-    @property
-    def shows_last(self) -> bool:
-        """Always False: the echo tells nothing about a release."""
-        return False
-
-    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Return None: silence is the release."""
-        return None
 
 
 MM_PER_M = 1000

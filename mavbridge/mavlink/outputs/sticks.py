@@ -109,7 +109,6 @@ class OverrideOutput(StickOutput):
     """
 
     name: Output = "rc-override"
-    hides_receiver = True
     releases = 80
     """Sent over the four seconds of a release at most; the silence that follows lets another
     station override."""
@@ -134,10 +133,12 @@ class OverrideOutput(StickOutput):
         return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), pwm_us, saturated)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Compare RC_CHANNELS with the sent override."""
+        """Compare RC_CHANNELS, which shows our sticks in place of the receiver's."""
         if isinstance(body, RcChannels) and vehicle.params.calibration is not None:
             pwm_us = vehicle.params.calibration.stick_channels_us(body.channels_us)
             self.echo.received(pwm_us, body.boot_us, arrived_ns)
+        vehicle.condition.is_receiver_hidden = self.echo.has_sent
+        vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
