@@ -4,8 +4,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from pymavlink.dialects.v20 import ardupilotmega as dialect
-
 from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
@@ -51,7 +49,6 @@ from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import REFUSED_NS, Address, Connection, Transport
 
-SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
 """Two usual stick periods: a due request leaves before a stick message, never after it."""
 _HEARTBEAT_HZ = 1.0
@@ -81,11 +78,7 @@ class MavlinkLink:
         self._clock, self._config, self._keeps_packets = clock, config, keeps_packets
         self._packets: list[ForwardedPacket] = []
         self._samples: list[Sample] = []
-        self._codec = Codec(
-            source_system=config.source_system,
-            source_component=SOURCE_COMPONENT,
-            signing=signing,
-        )
+        self._codec = Codec(source_system=config.source_system, signing=signing)
         self._connection = Connection(transport, self._codec, clock, packet_log)
         self._report = self._connection.report
         self.fileno, self.close = self._connection.fileno, self._connection.close
@@ -200,23 +193,22 @@ class MavlinkLink:
 
     def _receive(self, vehicle: VehicleSession, message: ReceivedMessage, arrived_ns: int) -> None:
         """Process one message of the chosen vehicle."""
-        body, happened_ns, is_for_us = message.body, arrived_ns, True
+        body, happened_ns = message.body, arrived_ns
         if isinstance(body, LocalVelocity) and not vehicle.condition.is_velocity_usable(arrived_ns):
             self._counters.receive(f"{message.name} (invalid)", message.sequence, arrived_ns)
             vehicle.receive(message, arrived_ns)
             return
         self._counters.receive(message.name, message.sequence, arrived_ns)
-        match body:
-            case _ if isinstance(body, Measurement):
-                happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
-                self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
-            case Timesync() as reply:
-                self._timesync.receive(reply, arrived_ns)
-            case CommandAck() as ack:
-                is_for_us = ack.target in ((0, 0), self._codec.source)
-                if is_for_us:
-                    self.commands.receive(ack)
-        if is_for_us:
+        if isinstance(body, Measurement):
+            happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
+            self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
+        elif isinstance(body, Timesync):
+            self._timesync.receive(body, arrived_ns)
+        targets = ((0, 0), self._codec.source)
+        is_for_others = isinstance(body, CommandAck) and body.target not in targets
+        if isinstance(body, CommandAck) and not is_for_others:
+            self.commands.receive(body)
+        if not is_for_others:
             before = vehicle.params.interruption
             if (output := self._sender.output) is not None:
                 output.receive(message.body, vehicle, arrived_ns)
@@ -374,7 +366,7 @@ class MavlinkLink:
         """Send a STATUSTEXT for pilots who see only a ground station; no-op if read-only."""
         if self._config.readonly:
             return
-        for packet in self._codec.encode_statustext(dialect.MAV_SEVERITY_NOTICE, text):
+        for packet in self._codec.encode_statustext(text):
             self._sender.transmit(packet)
 
     def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:

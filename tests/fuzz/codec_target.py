@@ -52,8 +52,8 @@ def fuzz_codec(seed: int, count: int) -> None:
     draw = Random(f"codec {seed}")
     source = Datagrams(draw)
     vehicle = WireEnd()
-    datagrams = Codec(source_system=255, source_component=191)
-    stream = Codec(source_system=255, source_component=191)
+    datagrams = Codec(source_system=255)
+    stream = Codec(source_system=255)
     for number in range(count):
         if number % _SAMPLE_EVERY == 0:
             source.heard.append(sample(vehicle, draw))

@@ -26,7 +26,7 @@ def fuzz_signing(seed: int, count: int) -> None:
     key = draw.randbytes(32)
     vehicle, forger = _signing_end(key), _signing_end(draw.randbytes(32))
     signing = Signing(key, unix_ns=lambda: _UNIX_NS)
-    codec = Codec(source_system=255, source_component=191, signing=signing)
+    codec = Codec(source_system=255, signing=signing)
     fresh: set[bytes] = set()
     for number in range(count):
         is_genuine = number % _SAMPLE_EVERY == 0

@@ -107,4 +107,4 @@ class Flight:
 
 def codec() -> Codec:
     """Return our own end of the wire."""
-    return Codec(source_system=255, source_component=191)
+    return Codec(source_system=255)

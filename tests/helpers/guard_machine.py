@@ -153,7 +153,7 @@ class GuardWorld:
         self.vehicle = Copter(self.profile, CALIBRATION)
         self.vehicle.mode, self.vehicle.has_receiver = self.mode, self.has_receiver
         meaning = ActionMeaning(kind=self.kind)
-        codec = Codec(source_system=255, source_component=191)
+        codec = Codec(source_system=255)
         self.sender = ActionSender(Connection(self.wire, codec, self.clock), codec, self.clock)
         self.sender.begin_flight(meaning, None)
         self.sender.equip(self.vehicle)  # type: ignore[arg-type]

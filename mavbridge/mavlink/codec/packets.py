@@ -85,12 +85,13 @@ def _zeros(layout: struct.Struct) -> tuple[float | bytes, ...]:
 
 
 class Codec:
-    """One MAVLink 2 endpoint without I/O; owns unfinished packets and the sending sequence."""
+    """Onboard computer's end of MAVLink 2, without I/O.
 
-    def __init__(
-        self, *, source_system: int, source_component: int, signing: Signing | None = None
-    ) -> None:
-        self.source = Endpoint(source_system, source_component)
+    Owns unfinished packets and the sending sequence.
+    """
+
+    def __init__(self, *, source_system: int, signing: Signing | None = None) -> None:
+        self.source = Endpoint(source_system, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._sequence = 0
         self._partials: dict[SocketAddress | None, bytes] = {}
         """Beginning of a packet whose end has not arrived, by sender; None: a stream's peer."""
@@ -306,13 +307,13 @@ class Codec:
         """Encode a TIMESYNC request."""
         return self._pack(dialect.MAVLink_timesync_message, 0, ts1)
 
-    def encode_statustext(self, severity: int, text: str) -> list[bytes]:
-        """Encode STATUSTEXT in one or more packets, truncated after 200 bytes.
+    def encode_statustext(self, text: str) -> list[bytes]:
+        """Encode STATUSTEXT, a notice, in one or more packets, truncated after 200 bytes.
 
         Non-ASCII characters become question marks, since ground stations decode them differently.
         """
         data = text.encode("ascii", "replace")[: TEXT_BYTES * _TEXT_CHUNKS]
-        kind = dialect.MAVLink_statustext_message
+        kind, severity = dialect.MAVLink_statustext_message, dialect.MAV_SEVERITY_NOTICE
         if len(data) <= TEXT_BYTES:
             return [self._pack(kind, severity, data, 0, 0)]
         self._text_id = self._text_id % 65535 + 1

@@ -88,7 +88,7 @@ def samples_of(
     packets: Iterable[ForwardedPacket],
 ) -> Iterator[tuple[tuple[Sample, ...], Telemetry]]:
     """Yield the samples that the guard took from recorded packets, and all readings after each."""
-    codec, collector = Codec(source_system=0, source_component=0), TelemetryCollector()
+    codec, collector = Codec(source_system=0), TelemetryCollector()
     for arrived_ns, happened_ns, data in packets:
         samples: tuple[Sample, ...] = ()
         for message in codec.decode_datagram(data):

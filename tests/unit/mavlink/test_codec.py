@@ -510,7 +510,7 @@ def test_packets_are_pymavlinks_to_the_last_byte(kind: int | None) -> None:
 @pytest.mark.parametrize("length", [0, 1, 49, 50, 51, 99, 100, 101, 200])
 def test_a_text_arrives_whole_in_as_many_chunks_as_it_needs(length: int) -> None:
     text = "".join(chr(97 + k % 26) for k in range(length))
-    packets = codec().encode_statustext(dialect.MAV_SEVERITY_NOTICE, text)
+    packets = codec().encode_statustext(text)
     chunks = [message for packet in packets for message in WireEnd().read(packet)]
     assert "".join(chunk.text for chunk in chunks) == text
     assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
@@ -525,8 +525,8 @@ def test_a_text_arrives_whole_in_as_many_chunks_as_it_needs(length: int) -> None
 
 def test_texts_are_bounded_ascii_and_numbered() -> None:
     ours = codec()
-    packets = ours.encode_statustext(4, "5\N{DEGREE SIGN}" + "x" * 300)
+    packets = ours.encode_statustext("5\N{DEGREE SIGN}" + "x" * 300)
     assert "".join(sent(packet).text for packet in packets) == "5?" + "x" * 198
     ours._text_id = 65534
-    ids = [sent(ours.encode_statustext(4, "x" * 51)[0]).id for _ in range(3)]
+    ids = [sent(ours.encode_statustext("x" * 51)[0]).id for _ in range(3)]
     assert ids == [65535, 1, 2]  # beyond the last number they begin again

@@ -28,7 +28,7 @@ def make_codec(key=KEY, *, day=None, state=None):
         signing = None
     else:
         signing = Signing(key, unix_ns=day or TimeOfDay(NOW_NS), state=state or SigningState())
-    return Codec(source_system=255, source_component=191, signing=signing)
+    return Codec(source_system=255, signing=signing)
 
 
 def make_vehicle(key=KEY, *, ticks=NOW_TICKS, component=1, link_id=0):

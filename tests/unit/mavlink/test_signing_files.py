@@ -77,7 +77,7 @@ def test_a_key_of_zeros_and_a_pipe_are_refused(tmp_path):
 
 def sign_one(signing):
     """The timestamp of one more packet."""
-    packet = Codec(source_system=255, source_component=191, signing=signing).encode_heartbeat()
+    packet = Codec(source_system=255, signing=signing).encode_heartbeat()
     return int.from_bytes(packet[-12:-6], "little")
 
 

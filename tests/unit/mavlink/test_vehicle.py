@@ -77,7 +77,7 @@ class Session:
             ActionMeaning(),
             None,
             profile=self.session.profile,
-            codec=Codec(source_system=255, source_component=191),
+            codec=Codec(source_system=255),
         )
         self.session.use_output(self.output.name)
         self.params: dict[str, float] = dict(CALIBRATION)
