@@ -3,13 +3,14 @@
 import sys
 from collections.abc import Iterator
 from functools import partial
+from multiprocessing import TimeoutError as PoolTimeoutError
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
-from mavbridge.commands.check.computer import computer_rows
 from mavbridge.commands.check.policy import check_policy
 from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
 from mavbridge.commands.check.soak import soak
@@ -17,9 +18,11 @@ from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
 from mavbridge.commands.output import as_json, print_status, text_console, write_json
 from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
 from mavbridge.core.files import empty_folders_removed, require_writable
+from mavbridge.core.realtime import settle_guard, usable_cores
 from mavbridge.flight.checks import file_checks, output_folders
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import looks_at_images, require_images
@@ -28,7 +31,12 @@ from policy.preprocess import least_source_px
 
 STDOUT = Path("-")
 NO_VEHICLE = "none"
+_CORES = 2
+"""One core for the guard and one for the policy, so that neither delays the other."""
+_TRIAL_S = 20
+"""Time in which a new process must have tried the rights of the guard."""
 _camera_row = partial(CheckRow, "camera", "cameras")
+_computer_row = partial(CheckRow, "computer")
 
 
 def check(config: CheckConfig) -> int:
@@ -48,7 +56,7 @@ def check(config: CheckConfig) -> int:
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
         rows = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
-    rows += [*cameras, *policy, *computer_rows(flight.rates), *_file_rows(flight)]
+    rows += [*cameras, *policy, *_computer_rows(flight.rates), *_file_rows(flight)]
     soaked: dict[str, object] | None = None
     if config.soak is not None:
         print_status(f"flying the bundled vehicle for {config.soak:g} s")
@@ -56,7 +64,7 @@ def check(config: CheckConfig) -> int:
             result = soak(flight, clock, duration_s=config.soak)
             soaked, row = result.document(), result.row()
         except MavbridgeError as error:
-            row = CheckRow("computer", "soak", "not flown", no_go=str(error))
+            row = _computer_row("soak", "not flown", no_go=str(error))
         rows.append(row)
     document = as_document(rows) | {"soak": soaked}
     if not is_on_stdout:
@@ -67,15 +75,36 @@ def check(config: CheckConfig) -> int:
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
 
 
+def _computer_rows(rates: Rates) -> Iterator[CheckRow]:
+    """Yield rows about cores, real-time scheduling and locked memory."""
+    cores = usable_cores()
+    shared = "guard and policy share one core: a slow policy delays the sticks"
+    yield _computer_row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
+    try:  # in a process of its own, so that this one is not affected
+        with get_context("spawn").Pool(1) as pool:
+            trial = pool.apply_async(settle_guard, kwds={"realtime": rates.realtime})
+            refused = trial.get(_TRIAL_S) or ""
+    except PoolTimeoutError:
+        refused = f"the rights of the guard could not be tried: no answer in {_TRIAL_S} s"
+    except OSError as error:
+        refused = f"the rights of the guard could not be tried: {error}"
+    yield _computer_row(
+        "rights of the guard",
+        "refused in part" if refused else "granted",
+        "SCHED_FIFO and locked memory" if rates.realtime else "locked memory",
+        refused,
+    )
+
+
 def _file_rows(config: FlyConfig) -> Iterator[CheckRow]:
     """Yield a row on each file that the flight uses, and on its viewer."""
     with empty_folders_removed(*output_folders(config)):
         for name, value, check_file in file_checks(config):
             try:
                 check_file()
-                yield CheckRow("computer", name, str(value))
+                yield _computer_row(name, str(value))
             except MavbridgeError as error:
-                yield CheckRow("computer", name, str(value), no_go=str(error))
+                yield _computer_row(name, str(value), no_go=str(error))
 
 
 def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:

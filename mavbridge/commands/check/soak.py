@@ -4,38 +4,38 @@ A policy that crashes its vehicle could not be measured for long. Therefore each
 in full, and then its values are replaced by the sticks of a slow level climb.
 """
 
+import platform
 import sys
+import threading
+import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mavbridge.camera.open import NO_CAMERA
-from mavbridge.commands.check.computer import (
-    Computer,
-    Usage,
-    hottest_c,
-    read_usage,
-    this_computer,
-)
 from mavbridge.commands.check.policy import HELD
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.commands.output import number
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
-from mavbridge.core.processes import end, free_port, log_tail, running
-from mavbridge.core.reasons import Kind, Reason
+from mavbridge.core.processes import free_port, log_tail, running
+from mavbridge.core.provenance import versions
+from mavbridge.core.realtime import usable_cores
+from mavbridge.core.reasons import Kind
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_policy
 from mavbridge.flight.guard_process import start_guard
-from mavbridge.flight.plan import FlightPlan, plan_flight
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 
+PROC, SYS = Path("/proc"), Path("/sys")
+_GOVERNOR = "devices/system/cpu/cpu0/cpufreq/scaling_governor"
 CLIMB_STICK = 0.3
 """Stick for 0.3 m/s up in ALT_HOLD: beyond the dead zone, some 20 m per minute."""
 NO_CEILING = EnvelopeConfig(max_height=0.0)
@@ -49,18 +49,111 @@ USAGE_NS = NS_PER_S // 4
 
 
 @dataclass(frozen=True, kw_only=True)
+class Computer:
+    """Description of a computer; an empty text is unknown."""
+
+    model: str
+    """Name of the board, as a Raspberry Pi or a Jetson tells it."""
+    cpu: str
+    machine: str
+    """Architecture, as x86_64 or aarch64."""
+    cores: int
+    """Cores that this process may use."""
+    kernel: str
+    governor: str
+    """Governor of the clock of CPU 0."""
+    versions: dict[str, str]
+    """Versions of Python, mavbridge and the packages that compute."""
+
+
+def this_computer() -> Computer:
+    """Describe this computer."""
+    lines = _text(PROC / "cpuinfo").splitlines()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return Computer(
+        model=_text(PROC / "device-tree/model").strip("\0"),
+        cpu=next(names, platform.processor() or "unknown processor"),
+        machine=platform.machine(),
+        cores=usable_cores(),
+        kernel=platform.release(),
+        governor=_text(SYS / _GOVERNOR),
+        versions=versions(),
+    )
+
+
+def hottest_c() -> float | None:
+    """Return the highest temperature that the kernel tells [degrees Celsius]; None: it tells
+    none."""
+    texts = (_text(zone) for zone in SYS.glob("class/thermal/thermal_zone*/temp"))
+    return max((int(text) / 1000 for text in texts if text.lstrip("-").isdigit()), default=None)
+
+
+def used_ns(guard_pid: int) -> dict[str, int]:
+    """Return the processor times so far of the processes "flight" (this one) and "guard", and, as
+    "flight/NAME", of each thread of this process; "flight/others" are threads of libraries."""
+    names = {thread.native_id: thread.name for thread in threading.enumerate()}
+    used = {"flight": time.process_time_ns(), "guard": _ran_ns(PROC / str(guard_pid))}
+    for task in (PROC / "self/task").glob("*"):
+        name = f"flight/{names.get(int(task.name), 'others')}"
+        used[name] = used.get(name, 0) + _ran_ns(task)
+    return used
+
+
+def _ran_ns(process: Path) -> int:
+    """Return the time for which a process or thread ran (sched-stats.rst); 0: not told."""
+    return int((_text(process / "schedstat").split() or ["0"])[0])
+
+
+def _text(path: Path) -> str:
+    """Return the text of a small system file; empty if there is none."""
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""
+
+
+class UsageMeter:
+    """``TickSink`` that reads processor times and temperature while the policy flies."""
+
+    def __init__(self, clock: Clock, guard_pid: int) -> None:
+        self._clock = clock
+        self._guard_pid = guard_pid
+        self._first: tuple[int, dict[str, int]] | None = None
+        """Time of the first reading, and the times used so far."""
+        self._last: tuple[int, dict[str, int]] = (0, {})
+        self.hottest_c: float | None = None
+
+    def emit(self, event: Event) -> None:
+        """Read the counters if the policy flies and the last reading is old enough."""
+        if not isinstance(event, Tick) or event.trace is None:
+            return
+        now_ns = self._clock.now_ns()
+        if self._first is not None and now_ns - self._last[0] < USAGE_NS:
+            return
+        self._last = now_ns, used_ns(self._guard_pid)
+        self._first = self._first or self._last
+        heats_c = [heat_c for heat_c in (self.hottest_c, hottest_c()) if heat_c is not None]
+        self.hottest_c = max(heats_c, default=None)
+
+    @property
+    def cores(self) -> dict[str, float]:
+        """Processor time over elapsed time, by the names of ``used_ns``."""
+        (begin_ns, before), (end_ns, after) = self._first or self._last, self._last
+        elapsed_ns = max(end_ns - begin_ns, 1)
+        return {
+            name: round((used - before.get(name, 0)) / elapsed_ns, 3)
+            for name, used in after.items()
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
 class Soak:
     """Result of a soak."""
 
     computer: Computer
     timing: TimingReport
     cpu_cores: dict[str, float]
-    """Processor time over elapsed time of the processes "flight" and "guard", and, as
-    "flight/NAME", of each thread of the flight process."""
-    guard_waited_ms: float
-    """Time in which the guard was runnable, but the kernel ran others."""
-    host_took_ms: float
-    """Time in which the hypervisor gave this machine's processors to others."""
+    """See ``UsageMeter.cores``."""
     hottest_c: float | None
     """Highest temperature [degrees Celsius]; None: this system tells none."""
 
@@ -92,79 +185,6 @@ class Soak:
         )
 
 
-class FlightMeter:
-    """``TickSink`` that measures from the policy's first action on.
-
-    Waiting, handshake and arming consist of cheap, punctual ticks that would flatter a slow engine.
-    """
-
-    def __init__(
-        self, plan: FlightPlan, runner: PolicyRunner, *, clock: Clock, guard_pid: int
-    ) -> None:
-        self._runner = runner
-        self._clock = clock
-        self._guard_pid = guard_pid
-        self._timing = FlightTiming(
-            stick_hz=plan.config.rates.stick_rate,
-            action_hz=plan.loops.action_hz,
-            vision_hz=plan.image_rates_hz[0],
-        )
-        self._first: Usage | None = None
-        self._last: Usage | None = None
-        self._hottest_c: float | None = None
-        self.release_reason: Reason | None = None
-        """Reason why the policy lost the sticks early; None if it kept them."""
-
-    def emit(self, event: Event) -> None:
-        """Count the event."""
-        if isinstance(event, Tick) and event.trace is not None:
-            self._read_usage()
-        if self._first is not None:
-            self._timing.emit(event)
-            reason = event.release_reason if isinstance(event, Tick) else None
-            if reason is not None and reason.kind is not Kind.END:
-                self.release_reason = self.release_reason or reason
-
-    def _read_usage(self) -> None:
-        if self._last is not None and self._clock.now_ns() - self._last.at_ns < USAGE_NS:
-            return
-        self._last = read_usage(self._clock, self._guard_pid)
-        self._first = self._first or self._last
-        heats_c = [heat_c for heat_c in (self._hottest_c, hottest_c()) if heat_c is not None]
-        self._hottest_c = max(heats_c, default=None)
-
-    def report(self) -> TimingReport:
-        """Return the figures of the flight so far, without those of its link."""
-        return self._timing.report(
-            mode="dual" if self._runner.dual_rate else "single",
-            engine=self._runner.engine,
-            policy=self._runner.name,
-            autopilot=None,
-            link=None,
-            observer_drops=ObserverDrops(rerun=None, recorder=None),
-        )
-
-    def figures(self) -> Soak:
-        """Return all figures of the flight.
-
-        Raises:
-            PeerError: the policy never had the sticks.
-        """
-        first, last = self._first, self._last
-        if first is None or last is None:
-            raise PeerError("the policy never had the sticks of the bundled vehicle")
-        elapsed_ns = max(last.at_ns - first.at_ns, 1)
-        spent_ns = {name: used - first.used_ns.get(name, 0) for name, used in last.used_ns.items()}
-        return Soak(
-            computer=this_computer(),
-            timing=self.report(),
-            cpu_cores={name: round(spent / elapsed_ns, 3) for name, spent in spent_ns.items()},
-            guard_waited_ms=round((last.guard_waited_ns - first.guard_waited_ns) / NS_PER_MS, 1),
-            host_took_ms=round((last.host_ns - first.host_ns) / NS_PER_MS, 1),
-            hottest_c=self._hottest_c,
-        )
-
-
 def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
     """Load the policy of ``config``, and fly the bundled vehicle for ``duration_s``.
 
@@ -185,14 +205,11 @@ def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
         source = NO_CAMERA if set(config.camera.sources) == {NO_CAMERA} else shared
         flight = climb_config(config, runner.contract, port=port, source=source)
         try:
-            meter = fly_and_measure(replace(flight, duration=duration_s), runner, clock)
+            return fly_and_measure(replace(flight, duration=duration_s), runner, clock)
         except MavbridgeError as error:
             if vehicle.poll() is None:
                 raise
             raise UserError(f"python -m sitl failed: {log_tail(log)}") from error
-        finally:
-            end(vehicle)
-    return meter.figures()
 
 
 def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: str) -> FlyConfig:
@@ -213,7 +230,7 @@ def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: st
     )
 
 
-def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> FlightMeter:
+def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Soak:
     """Fly ``config.duration`` with a loaded policy, and measure it.
 
     Raises:
@@ -221,18 +238,42 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Fl
         MavbridgeError: it could not be flown.
     """
     plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
+    timing = FlightTiming(
+        stick_hz=config.rates.stick_rate,
+        action_hz=plan.loops.action_hz,
+        vision_hz=plan.image_rates_hz[0],
+    )
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
-        meter = FlightMeter(plan, runner, clock=clock, guard_pid=guard.pid)
-        fly_policy(
-            plan, runner, clock=clock, console=patient_console(), sinks=(meter,), guard=guard
-        )
-    if meter.release_reason is not None:
-        raise PeerError(f"the policy lost the sticks: {meter.release_reason}")
-    lasted_s, wanted_s = meter.report().duration_s, config.duration or 0.0
-    if lasted_s < LEAST_SHARE * wanted_s:
-        raise PeerError(f"the flight lasted {lasted_s:g} s instead of {wanted_s:g} s")
-    return meter
+        usage, console = UsageMeter(clock, guard.pid), patient_console()
+        fly_policy(plan, runner, clock=clock, console=console, sinks=(timing, usage), guard=guard)
+    report = timing.report(
+        mode="dual" if runner.dual_rate else "single",
+        engine=runner.engine,
+        policy=runner.name,
+        autopilot=None,
+        link=None,
+        observer_drops=ObserverDrops(rerun=None, recorder=None),
+    )
+    require_whole(report, config.duration or 0.0)
+    return Soak(
+        computer=this_computer(),
+        timing=report,
+        cpu_cores=usage.cores,
+        hottest_c=usage.hottest_c,
+    )
+
+
+def require_whole(report: TimingReport, wanted_s: float) -> None:
+    """Raise PeerError unless the policy flew for about as long as it was to."""
+    if not report.sticks.sends:
+        raise PeerError("the policy never had the sticks of the bundled vehicle")
+    for release in report.releases:
+        if release.reason.kind is not Kind.END:
+            raise PeerError(f"the policy lost the sticks: {release.reason}")
+    if report.sticks.flying_s < LEAST_SHARE * wanted_s:
+        flown_s = report.sticks.flying_s
+        raise PeerError(f"the flight lasted {flown_s:g} s instead of {wanted_s:g} s")
 
 
 def level_climb(runner: PolicyRunner) -> PolicyRunner:
