@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from mavbridge.commands.imagine.loop import (
     rollout,
 )
 from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput
-from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.meta import FlightMeta
@@ -116,7 +117,6 @@ class Finished:
 
     sha256: str
     model: TinyWorld
-    sampler: Sampler
     output: StreamedOutput
 
 
@@ -131,18 +131,12 @@ def run(
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model)
-    clock = MonotonicClock()
-    output = StreamedOutput(
-        out, sampler, plan, clock=clock, decode_video=decode_video, on_frame=on_frame
-    )
-    try:
+    output = StreamedOutput(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
+    with closing(output):
         for segment in segments(sampler, plan, decider):
             output.put(segment)
         output.finish()
-    except BaseException:
-        output.close()
-        raise
-    return Finished(output.sha256, model, sampler, output)
+    return Finished(output.sha256, model, output)
 
 
 def read_rows(out: Path) -> Any:

@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
@@ -50,7 +49,6 @@ class Sampler:
         """Wrap a model that is already on its device."""
         self.model = model
         self.config: WorldModelConfig = model.config
-        self.frames_decoded = 0
         self._ddim_steps = ddim_steps
         self._device = next(model.parameters()).device
 
@@ -66,7 +64,6 @@ class Sampler:
         """
         with torch.inference_mode(), torch_threads(1):
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
-        self.frames_decoded += len(pixels)
         return pixels
 
     def sample(
@@ -123,23 +120,13 @@ class ObservationQueue:
     The loop appends images once they are decoded: there can be fewer images than steps.
     """
 
-    def __init__(
-        self,
-        start: RolloutStart,
-        latents: Tensor,
-        *,
-        frame_dt_s: float,
-        images: int,
-        contract: Contract,
-    ) -> None:
-        """Begin with the observed past, whose images have ``latents`` [context_frames, C, h, w].
-
-        ``images`` and ``contract`` are those of the decider.
-        """
-        self._latents = deque(latents, maxlen=len(latents))
+    def __init__(self, start: RolloutStart, sampler: Sampler, decider: "Decider") -> None:
+        """Begin with the observed past."""
+        contract = decider.contract
+        self._latents = deque(sampler.encode(start.images), maxlen=len(start.images))
         self._states = deque(start.states, maxlen=len(start.states))
-        self.images: deque[ImageArray] = deque(start.images, maxlen=images)
-        self._step_ns = round(frame_dt_s * NS_PER_S)
+        self.images: deque[ImageArray] = deque(start.images, maxlen=decider.images)
+        self._step_ns = round(sampler.config.frame_dt_s * NS_PER_S)
         self._now_ns = start.newest_ns
         self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
         for at_ns, sticks in start.sent:
@@ -250,11 +237,8 @@ class WorldModelDecider:
         return actions
 
 
-class NoiseStage(IntEnum):
-    """Stage of an iteration that draws noise. The number is part of every seed: never renumber."""
-
-    DECIDE = 0
-    SIMULATE = 1
+DECIDE, SIMULATE = 0, 1
+"""Stages of an iteration that draw noise. The numbers are part of every seed: never renumber."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,9 +252,9 @@ class RolloutPlan:
     """Number of actions executed before the next decision."""
     seed: int
 
-    def stage_seed(self, iteration: int, stage: NoiseStage) -> int:
+    def stage_seed(self, iteration: int, stage: int) -> int:
         """Return the seed of one stage of one iteration, independent of all others."""
-        sequence = np.random.SeedSequence((self.seed, iteration, int(stage)))
+        sequence = np.random.SeedSequence((self.seed, iteration, stage))
         return int(sequence.generate_state(1, np.uint64)[0]) & MAX_SEED
 
 
@@ -300,16 +284,10 @@ def rollout(
     Raises:
         RolloutError: the world model imagines NaN or infinity.
     """
-    seen = ObservationQueue(
-        start,
-        sampler.encode(start.images),
-        frame_dt_s=sampler.config.frame_dt_s,
-        images=decider.images,
-        contract=decider.contract,
-    )
+    seen = ObservationQueue(start, sampler, decider)
     for iteration in range(plan.iterations):
-        actions = decider.decide(seen, plan.stage_seed(iteration, NoiseStage.DECIDE))
-        seed = plan.stage_seed(iteration, NoiseStage.SIMULATE)
+        actions = decider.decide(seen, plan.stage_seed(iteration, DECIDE))
+        seed = plan.stage_seed(iteration, SIMULATE)
         latents, states, _ = sampler.sample(seen.latents(), seen.states(), actions, seed=seed)
         decoded: dict[int, ImageArray] = {}
         if iteration + 1 < plan.iterations:

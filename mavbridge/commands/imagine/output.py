@@ -5,9 +5,10 @@ decodes, the writer process writes.
 """
 
 import hashlib
-import queue
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from threading import Event
 from typing import TypeAlias
@@ -22,14 +23,12 @@ from mavbridge.commands.imagine.loop import (
     RolloutPlan,
     Sampler,
     Segment,
-    torch_threads,
 )
-from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
-from mavbridge.core.workers import HungError, Worker
-from mavbridge.recording.folder import require_extra
+from mavbridge.core.workers import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS
@@ -57,9 +56,8 @@ def prepare_out(out: Path) -> None:
     """Check that a rollout can be written here.
 
     Raises:
-        UserError: the extra is not installed, the name is taken or not .mp4, or is not writable.
+        UserError: the name is taken or not .mp4, or is not writable.
     """
-    require_extra("imagine")
     if out.suffix != ".mp4":
         raise UserError(f"--out {out} must end in .mp4")
     for path in (out, out.with_suffix(".arrows"), out.with_suffix(".parquet")):
@@ -79,8 +77,8 @@ def writing(path: Path) -> Iterator[None]:
 
 
 QUEUED_SEGMENTS = 2
-"""Capacity of the decoder's queue in segments; when it is full, the loop waits, so that the slowest
-part sets the pace."""
+"""Most segments that wait for the decoder; the loop then waits, too, so that the slowest part sets
+the pace."""
 STALL_S = 120.0
 """Longest time without a finished frame."""
 END_S = 45.0
@@ -88,14 +86,10 @@ END_S = 45.0
 _POLL_S = 0.1
 
 
-_Job: TypeAlias = tuple[Segment, torch.cuda.Event | None]
-"""A segment, and the GPU event after which its latents can be read."""
-
-
 class StreamedOutput:
     """Writes frames and rows of segments to disk as they come. Used by the loop's thread.
 
-    Methods raise ``MavbridgeError`` if writing fails or has failed before.
+    Methods other than ``close`` raise ``MavbridgeError`` if writing fails or has failed before.
     """
 
     def __init__(
@@ -104,7 +98,6 @@ class StreamedOutput:
         sampler: Sampler,
         plan: RolloutPlan,
         *,
-        clock: Clock,
         decode_video: bool = True,
         on_frame: OnFrame | None = None,
     ) -> None:
@@ -112,18 +105,14 @@ class StreamedOutput:
         self.out = out
         self._plan = plan
         self._model = sampler.model
-        self._clock = clock
         self._frame_dt_s = sampler.config.frame_dt_s
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
-        self.frames_decoded = 0
-        """Frames decoded outside the loop's thread, whose own frames the sampler counts."""
         self._stream: torch.cuda.Stream | None = None
         """On a GPU, the decoder's stream beside the sampler's."""
         if (device := next(sampler.model.parameters()).device).type == "cuda":
             self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        self._jobs: queue.Queue[_Job | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = out.with_suffix(".arrows")
         self.video: VideoWriter | None = None
         with writing(self._table_path):
@@ -134,8 +123,12 @@ class StreamedOutput:
             except BaseException:
                 self._table.abandon()
                 raise
-        self._worker = Worker("mavbridge-rollout-decode", self._serve)
-        self._worker.start()
+        self._stop = Event()
+        self._open: deque[Future[None]] = deque()
+        """Segments that are not written yet."""
+        self._thread = ThreadPoolExecutor(
+            1, "mavbridge-rollout-decode", torch.set_num_threads, (1,)
+        )
 
     @property
     def sha256(self) -> str:
@@ -143,47 +136,36 @@ class StreamedOutput:
         return self._digest.hexdigest()
 
     @property
-    def decode_queue(self) -> int:
-        """Number of segments waiting to be decoded."""
-        return self._jobs.qsize()
+    def open_segments(self) -> int:
+        """Number of segments that are not written yet."""
+        return sum(not segment.done() for segment in self._open)
 
     def put(self, segment: Segment) -> None:
-        """Queue a segment; wait while the queue is full."""
+        """Hand over a segment; wait while ``QUEUED_SEGMENTS`` are waiting."""
         ready = None
         if self.video is not None and segment.latents.is_cuda:
             ready = torch.cuda.current_stream(segment.latents.device).record_event()
-        self._enqueue((segment, ready))
+        self._wait(QUEUED_SEGMENTS)
+        self._open.append(self._thread.submit(self._serve, segment, ready))
 
-    def _enqueue(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
-        def was_put() -> bool:
-            if not self._worker.is_alive:
-                self._worker.join(END_S)  # raises the thread's exception
-                raise RuntimeError("the thread ended before its work did")
-            try:
-                self._jobs.put(job, timeout=_POLL_S)
-            except queue.Full:
-                return False
-            return True
-
-        self._wait_until(was_put, on_wait)
-
-    def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
-        """Wait for the condition, which itself waits ``_POLL_S``, as long as frames are finished.
+    def _wait(self, most: int, on_wait: Callable[[], None] = lambda: None) -> None:
+        """Wait until at most ``most`` segments are open, as long as frames are finished.
 
         Waits are counted, not timed: a pause of the process (Ctrl-Z) is one of them.
         """
         seen, waits = self.frames, 0
-        while not condition():
+        while len(self._open) > most:
             on_wait()
+            if wait([self._open[0]], _POLL_S).done:
+                self._open[0].result()  # raises the thread's exception, also at the next call
+                self._open.popleft()
             seen, waits = self.frames, waits + 1 if self.frames == seen else 0
             if waits * _POLL_S > STALL_S:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Process the queue, close the files, and compare their lengths."""
-        self._enqueue(None, on_wait)
-        self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
-        self._worker.join(END_S)
+        """Write all segments, close the files, and compare their lengths."""
+        self._wait(0, on_wait)
         if self.video is not None:
             self.video.finish()
             if self.video.written != self._table.rows:
@@ -194,25 +176,24 @@ class StreamedOutput:
             self._table.finish()
 
     def close(self) -> None:
-        """Stop the thread and the writer; the data written so far stays readable."""
-        with suppress(BaseException):  # its exception led here
-            self._worker.join(END_S)
+        """Stop the thread and the writer, if ``finish`` did not; what is written stays readable."""
+        self._stop.set()
+        is_hung = bool(wait(self._open, END_S).not_done)
+        self._thread.shutdown(wait=not is_hung)
         if self.video is not None:
             self.video.close()
         self._table.abandon()
 
-    def _serve(self, stop: Event) -> None:
-        with torch_threads(1):
-            while not stop.is_set():
-                try:
-                    job = self._jobs.get(timeout=_POLL_S)
-                except queue.Empty:
-                    continue
-                if job is None:
-                    return
-                self._write(*job, stop)
+    def _serve(self, segment: Segment, ready: torch.cuda.Event | None) -> None:
+        """Write a segment, whose latents can be read after ``ready``; none after an error."""
+        try:
+            if not self._stop.is_set():
+                self._write(segment, ready)
+        except BaseException:
+            self._stop.set()
+            raise
 
-    def _write(self, segment: Segment, ready: torch.cuda.Event | None, stop: Event) -> None:
+    def _write(self, segment: Segment, ready: torch.cuda.Event | None) -> None:
         plan = self._plan
         frames = [
             RolloutFrame(
@@ -235,21 +216,16 @@ class StreamedOutput:
         missing = [row for row in range(plan.frames) if row not in segment.decoded]
         images = self._decoded(segment.latents, missing, ready)
         for frame in frames:
-            if stop.is_set():
+            if self._stop.is_set():
                 return
             rgb = None
             if self.video is not None:
                 rgb = segment.decoded.get(frame.frame)
                 if rgb is None:
                     rgb = next(images)
-                    self.frames_decoded += 1
                 # Frames of the video are evenly spaced.
-                captured_ns = round(frame.number * frame.frame_dt_s * NS_PER_S)
-                row = FrameRow(
-                    frame_id=frame.number,
-                    captured_ns=captured_ns,
-                    ready_ns=self._clock.now_ns(),
-                )
+                at_ns = round(frame.number * frame.frame_dt_s * NS_PER_S)
+                row = FrameRow(frame_id=frame.number, captured_ns=at_ns, ready_ns=at_ns)
                 self.video.submit(rgb, row)
                 self._digest.update(np.ascontiguousarray(rgb).data)
             if self._on_frame is not None:

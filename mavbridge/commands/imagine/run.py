@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from mavbridge.commands.imagine.loop import (
 from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
@@ -48,7 +49,6 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 def imagine(config: ImagineConfig) -> int:
     """Imagine a flight; if interrupted, return 130 and keep the output so far."""
     console = text_console(stderr=True)
-    clock = MonotonicClock()
     plan = RolloutPlan(
         iterations=config.n_iter,
         frames=config.frames or config.exe_steps,
@@ -74,25 +74,22 @@ def imagine(config: ImagineConfig) -> int:
     # last of them is done.
     free = torch.get_num_threads() - 1
     with ExitStack() as stack:
-        decider = _make_decider(config, sampler, clock, console, stack)
+        decider = _make_decider(config, sampler, console, stack)
         stack.enter_context(torch_threads(free))
         on_frame: OnFrame | None = None
         if config.rerun != "off":
             from mavbridge.observe.viewer.rollout import RolloutView
 
-            real = RealFrames(flight, model.config, start.newest_ns)
+            images = real_images(flight, model.config, start.newest_ns)
+            real = RealFrames(images, model.config.frames)
             view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
             on_frame = view.show
         output = StreamedOutput(
-            config.out,
-            sampler,
-            plan,
-            clock=clock,
-            decode_video=config.decode_video,
-            on_frame=on_frame,
+            config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
         )
+        stack.callback(output.close)
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
-    _print_summary(config, sampler, output)
+    _print_summary(config, output)
     if was_stopped:
         console.print("interrupted: the files hold what was imagined so far", style="yellow")
     return INTERRUPTED if was_stopped else 0
@@ -117,7 +114,7 @@ def run_rollout(
             task = bar.add_task("imagining", total=plan.iterations * plan.frames, status="")
 
             def refresh() -> None:
-                status = f"iteration {done}/{plan.iterations}, to decode {output.decode_queue}"
+                status = f"iteration {done}/{plan.iterations}, to decode {output.open_segments}"
                 bar.update(task, completed=output.frames, status=status)
 
             for segment in rollout(sampler, decider, start, plan):
@@ -130,18 +127,15 @@ def run_rollout(
             refresh()
             return stop.is_set() and done < plan.iterations
     except MavbridgeError as error:
-        output.close()
+        output.close()  # what it wrote can then be read
         files = (output.out, output.out.with_suffix(".arrows"))
         made = " and ".join(str(file) for file in files if file.exists())
         left = f"what was written before is readable in {made}" if made else "nothing was written"
         raise RolloutError(f"{error}; {left}") from error
-    except BaseException:
-        output.close()
-        raise
 
 
 def _make_decider(
-    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console, stack: ExitStack
+    config: ImagineConfig, sampler: Sampler, console: Console, stack: ExitStack
 ) -> Decider:
     if config.decider == "world-model":
         named = {"checkpoint": config.policy.checkpoint, "policy": config.policy.policy}
@@ -153,21 +147,18 @@ def _make_decider(
                 )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
     wanted = replace(config.policy, dual_rate=True)
-    loaded = stack.enter_context(load_configured_policy(wanted, clock))
+    loaded = stack.enter_context(load_configured_policy(wanted, MonotonicClock()))
     for note in loaded.notes:
         console.print(note, style="yellow" if isinstance(note, Warned) else "dim")
     return PolicyDecider(loaded.runner, sampler)
 
 
-def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
-    console = text_console()
-    decoded = sampler.frames_decoded + output.frames_decoded
-    what = f"{config.out}: {output.frames} frames"
+def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:
+    lines = [f"{config.out}: {output.frames} frames", f"sha256 of the frames: {output.sha256}"]
     if not config.decode_video:
-        what = f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"
-    console.print(f"{what}, {decoded} decoded", soft_wrap=True)
-    if config.decode_video:
-        console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)
+        lines = [f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"]
+    for line in lines:
+        text_console().print(line, soft_wrap=True)
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
@@ -259,40 +250,38 @@ def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
     return int(np.abs(stamps_ns - at_ns).argmin())
 
 
+def real_images(
+    flight: RecordedFlight, config: WorldModelConfig, newest_ns: int
+) -> Iterator[ImageArray]:
+    """Yield the images of the flight's camera after the start, at the world model's times and
+    size."""
+    captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
+    images = enumerate(flight.rgb_images())
+    number, rgb = next(images)
+    for step in count(1):
+        at_ns = newest_ns + round(step * config.frame_dt_s * NS_PER_S)
+        if at_ns > captured_ns[-1]:
+            return
+        while number < _nearest(
+            captured_ns, at_ns
+        ):  # two steps may share an image of a slow camera
+            number, rgb = next(images)
+        yield resize(rgb, config.image_size, config.image_size)
+
+
 class RealFrames:
-    """Images of the flight's camera after the start, at the world model's times and size.
+    """The newest of ``real_images``, as many as one segment has, because segments overlap."""
 
-    Decodes forward only. Keeps as many frames as one segment has, because segments overlap.
-    """
-
-    def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
-        self._captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
-        self._images: Iterator[ImageArray] = flight.rgb_images()
-        self._config = config
-        self._newest_ns = newest_ns
-        self._decoded = 0
+    def __init__(self, images: Iterator[ImageArray], frames: int) -> None:
+        self._images = images
         self._newest_step = 0
-        self._window: deque[ImageArray] = deque(maxlen=config.frames)
+        self._window: deque[ImageArray] = deque(maxlen=frames)
 
     def at(self, step: int) -> ImageArray | None:
-        """Return the frame ``step`` times ``frame_dt_s`` after the start; None after the flight.
-
-        Raises:
-            ValueError: it has left the window: steps can go back by one segment at most.
-            VideoError: the video is damaged.
-        """
+        """Return the frame of a step; None after the flight. Raise VideoError if it is damaged."""
         while self._newest_step < step:
-            dt_s, size = self._config.frame_dt_s, self._config.image_size
-            at_ns = self._newest_ns + round((self._newest_step + 1) * dt_s * NS_PER_S)
-            if at_ns > self._captured_ns[-1]:
+            if (image := next(self._images, None)) is None:
                 return None
-            rgb = None
-            while self._decoded <= _nearest(self._captured_ns, at_ns):
-                rgb = next(self._images)
-                self._decoded += 1
+            self._window.append(image)
             self._newest_step += 1
-            # Two steps share a frame only if the camera is slower than the world model.
-            self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
-        if self._newest_step - step >= len(self._window):
-            raise ValueError(f"step {step} has left the window")
         return self._window[step - self._newest_step - 1]

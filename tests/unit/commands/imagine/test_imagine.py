@@ -1,4 +1,4 @@
-"""``mavbridge imagine`` from the command line."""
+"""``mavbridge imagine`` from the command line, and what ships with it."""
 
 import os
 import signal
@@ -6,16 +6,22 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from rerun.chunk import RrdReader
 
 from helpers.recordings import count_frames
 from helpers.rollouts import TinyWorld, read_rows, write_flight
-from helpers.status import told_by
+from helpers.status import status_of, told_by
 from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import Sampler
-from policy.checkpoints.networks import save_world_model
+from mavbridge.commands.imagine.run import SHIPPED
+from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.video.file import read_video
+from policy.checkpoints.networks import load_world_model, save_world_model
+from policy.preprocess import resize
 
 Imagine = Callable[..., tuple[int, str]]
 
@@ -54,7 +60,7 @@ def test_without_a_video_there_are_rows_and_nothing_is_decoded(
     flags = ("--n-iter", "2", "--exe-steps", "16", "--no-decode-video", "--fast-policy-no-decode")
     status, text = imagine(*flags)
     assert status == 0, text
-    assert "32 rows, no video, 0 decoded" in text
+    assert "32 rows, no video" in text
     assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
     assert read_rows(tmp_path / "a.mp4").num_rows == 32
 
@@ -112,3 +118,31 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     left = text.split("is readable in ")[1].split()[::2]
     assert left[-1].endswith("a.arrows")
     assert all(Path(name).exists() for name in left)
+
+
+ROOT = Path(__file__).parents[4]
+START = ROOT / "examples" / "start"
+
+
+@pytest.mark.parametrize(
+    "decider",
+    [("--decider", "world-model"), ("--decider", "toge", "--dual-rate")],
+    ids=["world-model", "toge"],
+)
+def test_the_documented_command_imagines_what_might_come(
+    decider: tuple[str, ...], tmp_path: Path
+) -> None:
+    out = tmp_path / "rollout.mp4"
+    flags = ("--n-iter", "2", "--exe-steps", "8", "--out", str(out), *decider)
+    assert status_of("imagine", "--start", START, *flags) == 0
+    rows, frames = read_rows(out), list(read_video(out))
+    assert rows.num_rows == len(frames) == 16
+    first_seen = resize(next(iter(open_flight(START).images())), 64, 64)
+    assert cv2.PSNR(frames[0], first_seen) > 15  # a tenth of a second on: the same place
+    speed_mps = np.linalg.norm(np.array(rows["state"].to_pylist())[:, :3], axis=1)
+    assert speed_mps.max() < 15
+
+
+def test_the_weights_are_small_enough_to_come_with_the_code() -> None:
+    assert SHIPPED.stat().st_size < 4_000_000
+    assert load_world_model(SHIPPED).config.contract.state_frame == "ned_frd"

@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.fakes import FakeClock
 from helpers.recordings import count_frames, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
-from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import read_video
@@ -29,12 +27,9 @@ PLAN = make_plan(iterations=1000)
 
 @contextmanager
 def output(out: Path, model: TinyWorld | None = None) -> Iterator[StreamedOutput]:
-    made = StreamedOutput(out, make_sampler(model), PLAN, clock=MonotonicClock())
-    try:
+    with closing(StreamedOutput(out, make_sampler(model), PLAN)) as made:
         yield made
-    finally:
-        made.close()
-    assert "mavbridge-rollout-decode" not in {thread.name for thread in threading.enumerate()}
+    assert not [each for each in threading.enumerate() if "rollout-decode" in each.name]
 
 
 def make_segment(iteration: int) -> Segment:
@@ -73,7 +68,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
             for iteration in range(1, 20):
                 made.put(make_segment(iteration))
                 put.append(iteration)
-                if made.decode_queue == QUEUED_SEGMENTS:
+                if made.open_segments > QUEUED_SEGMENTS:
                     is_full.set()
 
         producer = threading.Thread(target=produce)
@@ -137,23 +132,3 @@ def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
         with pytest.raises(HungError, match="no frame"):
             put_all(made)
         go_on.set()
-
-
-@pytest.mark.usefixtures("in_process_writer")
-def test_a_pause_of_the_process_is_no_hang(tmp_path: Path) -> None:
-    go_on, clock = threading.Event(), FakeClock()
-
-    class Waits(TinyWorld):
-        def decode(self, latents: Tensor) -> Tensor:
-            go_on.wait(DEADLINE_S)
-            return super().decode(latents)
-
-    def resume() -> None:
-        clock.advance_ns(1000 * NS_PER_S)
-        go_on.set()
-
-    with output(tmp_path / "a.mp4", Waits()) as made:
-        made._clock = clock
-        made.put(make_segment(0))
-        made.finish(resume)
-    require_whole(tmp_path / "a.mp4", 16)

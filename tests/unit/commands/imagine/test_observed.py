@@ -1,5 +1,6 @@
-"""From a recorded flight to what a rollout goes on from."""
+"""From a recorded flight to the start of a rollout, and what a decider observes."""
 
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,17 +11,21 @@ from helpers.factories import START_NS
 from helpers.rollouts import (
     SIZE,
     TINY,
+    TinyWorld,
     grey,
+    make_plan,
     make_sampler,
     make_start,
     noise_runner,
+    run,
     write_flight,
 )
-from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider
-from mavbridge.commands.imagine.run import RealFrames, read_start
+from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider, rollout
+from mavbridge.commands.imagine.output import QUEUED_SEGMENTS
+from mavbridge.commands.imagine.run import RealFrames, read_start, real_images
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import FloatArray
+from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
 from mavbridge.recording.flight_folder import open_flight
 from policy.contract import Contract
 
@@ -44,7 +49,8 @@ def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight:
 
 def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Path) -> None:
     opened = open_flight(flight)
-    real = RealFrames(opened, TINY, read_start(opened, TINY, 0.0).newest_ns)
+    images = real_images(opened, TINY, read_start(opened, TINY, 0.0).newest_ns)
+    real = RealFrames(images, TINY.frames)
     for step in (1, 2, 3, 4, 2, 3, 4, 5):  # segments overlap
         rgb = real.at(step)
         assert rgb.mean() == pytest.approx(grey(3 + 3 * step), abs=3)
@@ -85,12 +91,6 @@ def test_a_policy_by_body_rates_is_refused() -> None:
         PolicyDecider(noise_runner(other), make_sampler())
 
 
-def observe(contract: Contract) -> ObservationQueue:
-    sampler, start = make_sampler(), make_start()
-    latents = sampler.encode(start.images)
-    return ObservationQueue(start, latents, frame_dt_s=0.1, images=1, contract=contract)
-
-
 def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
     ramp = noise_runner()
     chunk = np.repeat(np.linspace(-0.8, 0.8, 16, dtype=np.float32)[None, :, None], 4, axis=2)
@@ -98,9 +98,65 @@ def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
     def act(*_: object) -> FloatArray:
         return chunk
 
-    actions = PolicyDecider(replace(ramp, act=act), make_sampler()).decide(
-        observe(ramp.contract), 0
-    )
+    sampler = make_sampler()
+    decider = PolicyDecider(replace(ramp, act=act), sampler)
+    actions = decider.decide(ObservationQueue(make_start(), sampler, decider), 0)
     # rows of the chunk are 0.05 s apart, steps 0.1 s: their mean is the row between; then held
     np.testing.assert_allclose(actions[:7, 0], chunk[0, 1:15:2, 0], atol=1e-6)
     np.testing.assert_allclose(actions[8:], 0.8, atol=1e-6)
+
+
+pytestmark = pytest.mark.usefixtures("in_process_writer")
+
+
+class RecordingDecider:
+    """A decider with a queue of two that keeps what it has seen."""
+
+    images = 2
+    contract = Contract()
+
+    def __init__(self) -> None:
+        self.seen: list[list[ImageArray]] = []
+        self.histories: list[FloatArray] = []
+
+    def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
+        self.seen.append(list(seen.images))
+        self.histories.append(seen.history())
+        return np.full((16, 4), 0.1 * len(self.seen), np.float32)
+
+
+@pytest.mark.parametrize("exe_steps", [1, 2, 7])
+def test_the_queue_gets_the_last_executed_frames_each_its_own(exe_steps: int) -> None:
+    model, decider, start = TinyWorld(), RecordingDecider(), make_start()
+    plan = make_plan(exe_steps=exe_steps, iterations=4)
+    segments = list(rollout(make_sampler(model), decider, start, plan))
+    executed = [*start.images]
+    for segment, seen in zip(segments, decider.seen, strict=True):
+        np.testing.assert_array_equal(seen, executed[-2:])
+        assert (seen[0] != seen[1]).any()
+        executed += list(model.decode(segment.latents[:exe_steps]).numpy())
+
+
+def test_the_history_is_in_seconds_before_and_after_the_start() -> None:
+    decider = RecordingDecider()
+    plan = make_plan(exe_steps=1)
+    list(rollout(make_sampler(), decider, make_start(), plan))
+    throttle = [history[0, :, 0].tolist() for history in decider.histories]
+    # 0.05 s a slot, 0.1 s a step; before the start the flight's own stick was held
+    np.testing.assert_allclose(throttle[0], [0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(throttle[1], [0.1, 0.1, 0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(throttle[2], [0.1, 0.1, 0.2, 0.2], rtol=1e-6)
+
+
+def test_no_frame_is_held_for_longer_than_a_queue_is_long(tmp_path: Path) -> None:
+    frames, seen, held = 4, list[weakref.ref[object]](), list[int]()
+
+    def on_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
+        seen.extend((weakref.ref(rgb), weakref.ref(frame.state)))
+        held.append(sum(one() is not None for one in seen))
+
+    plan = make_plan(iterations=96, frames=frames, exe_steps=2)
+    run(tmp_path / "a.mp4", plan, decider="toge", on_frame=on_frame)
+    assert len(seen) == 2 * 96 * frames
+    # A segment in hand, and what the loop observes.
+    assert max(held) <= 2 * (frames + QUEUED_SEGMENTS * frames) + 2
