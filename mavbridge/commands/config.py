@@ -277,26 +277,10 @@ class ReplayConfig(Ranged):
     def __post_init__(self) -> None:
         """Refuse what cannot be combined."""
         super().__post_init__()
-        changes_policy = self.is_other_policy or self.engine is not None or self.device is not None
-        if self.source == "chunks" and changes_policy:
+        of_policy = (self.policy, self.checkpoint, self.contract, self.num_diffusion_steps)
+        given = (*of_policy, self.engine, self.device)
+        if self.source == "chunks" and any(value is not None for value in given):
             raise UserError(
                 "--from chunks takes the recorded chunks and asks no policy: leave out the flags "
                 "of the policy, or use --from features or video"
             )
-
-    @property
-    def changes_encoder(self) -> bool:
-        """The recorded features may be of another network."""
-        given = (self.policy, self.checkpoint, self.contract)
-        return any(value is not None for value in given)
-
-    @property
-    def is_other_policy(self) -> bool:
-        """It is to decide differently; another engine is to decide the same."""
-        return self.changes_encoder or self.num_diffusion_steps is not None
-
-    @property
-    def changes_limits(self) -> bool:
-        """The guard is to do something else with the chunks."""
-        given = (self.tau, self.max_slew, self.max_feature_age, self.max_chunk_age)
-        return any(value is not None for value in given)

@@ -1,6 +1,6 @@
 """``mavbridge replay``: read a flight, compute it again, report the differences."""
 
-import math
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -66,21 +66,22 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     """Compute a recorded flight again; return an ``ExitCode``."""
     require_outputs(config.json, config.plot)
     source = open_source(folder)
-    config = _trusted(source, config)
-    chosen = _source_of(source, config)
+    require_trusted(source, config)
+    wanted = other_config(source.config, config)
+    chosen = _source_of(source, config.source, wanted)
     print_status(f"replaying {len(source.ticks)} ticks of {folder} through the guard")
     steps = replay_guard(source)
-    flown = replace(source, config=other_config(source.config, config))
+    flown = replace(source, config=wanted)
     plan, engine = recorded_plan(flown), source.meta.engine or ""
     frame = action_frame(source.contract)
     chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
     compared: PolicyComparison | None = None
     if chosen != "chunks":
         clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
-        with load_configured_policy(flown.config.policy, clock) as loaded:
+        with load_configured_policy(wanted.policy, clock) as loaded:
             runner = loaded.runner
             engine = runner.engine
-            plan = plan_flight(flown.config, runner.contract, is_dual=runner.dual_rate)
+            plan = plan_flight(wanted, runner.contract, is_dual=runner.dual_rate)
             pairs = _replayed(flown, runner, clock, chosen)
         compared = compare_policy(pairs)
         # The new chunks, by the serial numbers of the recorded ones.
@@ -93,10 +94,10 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         }
     is_same = compared is None or compared.equal_chunks == compared.solves
     traces = guard_traces(steps)
-    if config.changes_limits or not is_same:
+    if wanted.limits != source.config.limits or not is_same:
         traces = other_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
-        names = (None, *source.contract.cameras[1:])
+        names = source.contract.cameras
         damage = [text for name in names for text in open_flight(folder, name).damage]
         source = replace(source, gaps=tuple(dict.fromkeys((*source.gaps, *damage))))
     result = ReplayResult(
@@ -107,33 +108,24 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         guard=compare_guard(steps),
         sticks=traces,
         tolerance=tolerance_of(
-            config,
-            chosen,
-            is_same_engine=engine == source.meta.engine,
-            is_scripted=is_scripted(flown.config.policy),
+            config, source.config, wanted, chosen, is_same_engine=engine == source.meta.engine
         ),
     )
     print_replay(result, table_console())
-    write_json(config.json, _finite(as_document(result)))
+    # JSON lacks infinity: only one of the two was flown.
+    document = json.loads(json.dumps(as_document(result)), parse_constant=lambda _: None)
+    write_json(config.json, document)
     if config.plot is not None:
         draw(result, config.plot)
     return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
 
 
-def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
-    """Return the request, without the flight's own policy if that was named again.
-
-    Raises:
-        UserError: the recording names a policy that contains code, a server, or weights that are
-            not a file.
-    """
-    flown = source.config.policy
-    if (asked.policy, asked.checkpoint, asked.contract) == (
-        *(flown.policy, flown.checkpoint, flown.contract),
-    ):
-        return replace(asked, policy=None, checkpoint=None, contract=None)
+def require_trusted(source: ReplaySource, asked: ReplayConfig) -> None:
+    """Raise UserError if the recording names a policy that contains code, a server, or weights that
+    are not a file, and the user names none."""
     if asked.policy is not None or asked.source == "chunks":
-        return asked
+        return
+    flown = source.config.policy
     files = {"checkpoint": flown.checkpoint, "contract": flown.contract}
     what = foreign_policy(flown.policy)
     if flown.policy.startswith(("ws:", "wss:")):  # also one on this computer: it would get the key
@@ -151,19 +143,23 @@ def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
             raise UserError(
                 f"{source.folder} was flown with --{name} {path}, which is no file here: name it"
             )
-    return asked
 
 
-def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:
+def _weights(flight: FlyConfig) -> tuple[str, Path | None, Path | None]:
+    """Return what the features of a flight depend on: policy, checkpoint and contract file."""
+    return flight.policy.policy, flight.policy.checkpoint, flight.policy.contract
+
+
+def _source_of(source: ReplaySource, asked: ReplayFrom, wanted: FlyConfig) -> ReplayFrom:
     """Return the source of the policy's images; raise UserError if the recording lacks it."""
     has_features = bool(source.features)
-    if config.source == "features" and not has_features:
+    if asked == "features" and not has_features:
         raise UserError(
             f"{source.folder} is of a single-rate policy, which has no features: use --from video"
         )
-    if config.source != "auto":
-        return config.source
-    return "features" if has_features and not config.changes_encoder else "video"
+    if asked != "auto":
+        return asked
+    return "features" if has_features and _weights(wanted) == _weights(source.config) else "video"
 
 
 def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
@@ -184,12 +180,20 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
 
 
 def tolerance_of(
-    config: ReplayConfig, chosen: ReplayFrom, *, is_same_engine: bool, is_scripted: bool
+    asked: ReplayConfig,
+    flown: FlyConfig,
+    wanted: FlyConfig,
+    chosen: ReplayFrom,
+    *,
+    is_same_engine: bool,
 ) -> float | None:
     """Return the largest stick difference that counts as equal; None: no agreement is expected."""
-    if config.tolerance is not None:
-        return config.tolerance
-    if config.is_other_policy or config.changes_limits:
+    if asked.tolerance is not None:
+        return asked.tolerance
+    is_same_policy = (
+        _weights(wanted) == _weights(flown) and wanted.policy.steps == flown.policy.steps
+    )
+    if not is_same_policy or wanted.limits != flown.limits:
         return None
     if chosen == "video":
         return VIDEO_TOLERANCE
@@ -197,7 +201,7 @@ def tolerance_of(
         return 0.0
     if not is_same_engine:
         return ENGINE_TOLERANCE
-    return CLOCK_TOLERANCE if is_scripted else 0.0
+    return CLOCK_TOLERANCE if is_scripted(wanted.policy) else 0.0
 
 
 def _replayed(
@@ -233,7 +237,7 @@ def _encoded(
 ) -> Iterator[FeatureFrame]:
     """Yield the frames of one camera's video, encoded one by one, because images are large."""
     cv2.setNumThreads(1)
-    flight = open_flight(source.folder, name if number else None)
+    flight = open_flight(source.folder, name)
     faults = {
         each.frame_id: each.fault for each in (source.features[number] if source.features else ())
     }
@@ -352,15 +356,6 @@ def as_document(result: ReplayResult) -> dict[str, object]:
         "guard": asdict(result.guard),
         "sticks": asdict(result.sticks.deviation),
     }
-
-
-def _finite(value: object) -> object:
-    """Replace infinity, which JSON lacks, by null: only one of the two was flown."""
-    if isinstance(value, dict):
-        return {name: _finite(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if value == math.inf else value
 
 
 def draw(result: ReplayResult, path: Path) -> None:

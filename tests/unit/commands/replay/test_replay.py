@@ -22,6 +22,8 @@ from mavbridge.recording.folder import SETTINGS
 from mavbridge.simulation.replay.recording import open_source
 
 NUMPY = FLIGHTS / "numpy_px4"
+B = Path("b.pt")
+FLOWN = FlyConfig(policy=PolicyConfig(checkpoint=B, seed=3))
 
 
 def test_the_recorded_chunks_through_the_guard_are_equal_bit_for_bit(
@@ -68,13 +70,11 @@ def test_another_limit_shows_its_effect_and_is_no_failure(
 
 
 def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None:
-    flown = FlyConfig(policy=PolicyConfig(checkpoint=Path("a.pt"), seed=3, num_diffusion_steps=1))
+    changed = other_config(FLOWN, ReplayConfig(tau=0.1, num_diffusion_steps=2))
 
-    changed = other_config(flown, ReplayConfig(tau=0.1, num_diffusion_steps=2))
-
-    assert changed.limits == replace(flown.limits, tau=0.1)
-    assert changed.policy == replace(flown.policy, num_diffusion_steps=2)
-    other = other_config(flown, ReplayConfig(policy="scripted:hover"))
+    assert changed.limits == replace(FLOWN.limits, tau=0.1)
+    assert changed.policy == replace(FLOWN.policy, num_diffusion_steps=2)
+    other = other_config(FLOWN, ReplayConfig(policy="scripted:hover"))
     assert (other.policy.checkpoint, other.policy.seed) == (None, 3)
 
 
@@ -85,16 +85,23 @@ def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None
         (ReplayConfig(), "features", "torch", ENGINE_TOLERANCE),
         (ReplayConfig(), "video", "numpy", VIDEO_TOLERANCE),
         (ReplayConfig(), "chunks", "torch", 0.0),
-        (ReplayConfig(checkpoint=Path("b.pt")), "video", "numpy", None),
+        (ReplayConfig(checkpoint=Path("c.pt")), "video", "numpy", None),
         (ReplayConfig(tau=0.1), "features", "numpy", None),
+        (
+            ReplayConfig(num_diffusion_steps=1, policy="toge", checkpoint=B),
+            "features",
+            "numpy",
+            0.0,
+        ),
+        (ReplayConfig(num_diffusion_steps=2), "features", "numpy", None),
         (ReplayConfig(tau=0.1, tolerance=0.3), "features", "numpy", 0.3),
     ],
 )
 def test_what_counts_as_equal(
     config: ReplayConfig, chosen: ReplayFrom, engine: str, expected: float | None
 ) -> None:
-    is_same = engine == "numpy"
-    found = tolerance_of(config, chosen, is_same_engine=is_same, is_scripted=False)
+    wanted = other_config(FLOWN, config)
+    found = tolerance_of(config, FLOWN, wanted, chosen, is_same_engine=engine == "numpy")
     assert found == expected
 
 
