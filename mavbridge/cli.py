@@ -28,10 +28,10 @@ from mavbridge.config.flags import RARE
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import (
     Settings,
-    given_settings,
     print_settings,
     untrusted_settings,
     with_home,
+    with_settings,
 )
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
@@ -344,7 +344,8 @@ def with_config(
     if print_config:
         print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli)
         return 0
-    cli.config = [Settings(given_settings(set_config), source="--set-config")]
+    words = with_settings(tokens, set_config)
+    cli.config = []
     if config is not None:
         try:
             document = read_toml(user_path(config))
@@ -357,14 +358,14 @@ def with_config(
             raise UserError(
                 f"--config {config}: {misplaced[0]} is no key of a file: use the command line"
             )
-        for flag, value, what in [] if trust_config else untrusted_settings(document, tokens):
+        for flag, value, what in [] if trust_config else untrusted_settings(document, words):
             raise UserError(
                 f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
-        cli.config = [*cli.config, Settings(document, source=str(config))]
+        cli.config = [Settings(document, source=str(config))]
     with run_log(log_file, verbose=verbose):
-        status: int | None = cli(with_home(list(tokens)))
+        status: int | None = cli(with_home(words))
     return status or 0
 
 

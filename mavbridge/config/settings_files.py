@@ -80,21 +80,17 @@ _HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
 """A path below a home directory, behind a flag's name or a prefix such as ``lerobot:``."""
 
 
-def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]]:
-    """Return the settings of ``--set-config`` by section and key; raise UserError for a malformed
-    one."""
-    document: dict[str, dict[str, str | list[str]]] = {}
+def with_settings(tokens: Sequence[str], texts: Sequence[str]) -> list[str]:
+    """Return a command line with the settings of ``--set-config``, each as the hidden flag that it
+    is; raise UserError for a malformed one."""
     for text in texts:
-        if (match := re.fullmatch(r"([a-z]+)\.([\w-]+)=(.*)", text)) is None:
+        if re.fullmatch(r"[a-z]+\.[\w-]+=.*", text) is None:
             raise UserError(
                 f"--set-config {text} is not understood: use SECTION.NAME=VALUE, such as "
                 "limits.attitude_age=0.2 (see --print-config)"
             )
-        section, key = document.setdefault(match[1], {}), match[2].replace("-", "_")
-        before = section.get(key, [])
-        several = [*([before] if isinstance(before, str) else before), match[3]]
-        section[key] = match[3] if len(several) == 1 else several
-    return document
+    behind = 1 if tokens and not tokens[0].startswith("-") else 0  # the command
+    return [*tokens[:behind], *(f"--{text}" for text in texts), *tokens[behind:]]
 
 
 class Settings(Dict):

@@ -34,7 +34,7 @@ BLIND = "--policy scripted --camera none"
     [
         ("", "--connect"),
         (f"{FLY} --fly-high", "Unknown option: --fly-high"),
-        (f"{FLY} --set-config rates.action=fast", "[rates][action]"),
+        (f"{FLY} --set-config rates.action=fast", "Invalid value for --rates.action"),
         (f"{FLY} --readonly --arm", "--readonly sends nothing"),
         (f"{FLY} --set RC_OVERRIDE_TIME", "use NAME=VALUE"),
         (f"{FLY} --set-config link.accept_risk=all", "endless-override"),

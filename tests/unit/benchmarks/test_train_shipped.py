@@ -7,7 +7,7 @@ import pytest
 from benchmarks import train_shipped
 from benchmarks.train_shipped import STEPS
 from mavbridge.cli import cli
-from mavbridge.config.settings_files import Settings, given_settings
+from mavbridge.config.settings_files import with_settings
 
 
 @pytest.fixture
@@ -33,10 +33,8 @@ def test_every_command_is_one_of_ours(
     monkeypatch.chdir(tmp_path / policy)
     for command in commands:
         _, outer, _ = cli.meta.parse_args(command.split(), print_error=False, exit_on_error=False)
-        settings = given_settings(outer.arguments.get("set_config", ()))
-        with monkeypatch.context() as patch:
-            patch.setattr(cli, "config", [Settings(settings, source="test")])
-            cli.parse_args(list(outer.args), print_error=False, exit_on_error=False)
+        words = with_settings(outer.args, outer.arguments.get("set_config", ()))
+        cli.parse_args(words, print_error=False, exit_on_error=False)
 
 
 def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from helpers.guides import (
     page_name,
 )
 from mavbridge.cli import cli
-from mavbridge.config.settings_files import Settings, given_settings
+from mavbridge.config.settings_files import with_settings
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.profiles.ardupilot import ArduPilot
@@ -72,10 +72,8 @@ def parse_mavbridge(arguments: list[str]) -> None:
     words = list(outer.args)
     if words and not words[0].startswith("-"):
         assert words[0] in cli, f"unknown command {words[0]}"
-    settings = given_settings(outer.arguments.get("set_config", ()))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "config", [Settings(settings, source="test")])
-        cli.parse_args(words, print_error=False, exit_on_error=False)
+    words = with_settings(words, outer.arguments.get("set_config", ()))
+    cli.parse_args(words, print_error=False, exit_on_error=False)
 
 
 def parse_make(arguments: list[str]) -> None:
