@@ -50,9 +50,12 @@ def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
             "dataset (a folder with meta/info.json), nor ONNX (a file, or a folder of them)"
         )
     dataset = dataset or dataset_of(source)
-    if dataset is not None and (dataset / CONTRACT_FILE).is_file():
-        text = (dataset / CONTRACT_FILE).read_text(encoding="utf-8")
-        return text, f"a copy of {dataset / CONTRACT_FILE}, which mavbridge export wrote"
+    if dataset is not None and (known := dataset / CONTRACT_FILE).is_file():
+        try:
+            text = known.read_text(encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise UserError(f"{known} cannot be read: {error}") from error
+        return text, f"a copy of {known}, which mavbridge export wrote"
     text, summary = _described(source, checkpoint_entries(source, dataset))
     if dataset is None:
         return text, f"{summary}\nmore is known with the dataset that it was trained on: --dataset"

@@ -36,6 +36,7 @@ BAD = [
     ("check --connect none --policy none --soak 60", "--soak needs a policy"),
     ("contract empty", "neither a LeRobot policy"),
     ("contract broken.onnx", "broken.onnx cannot be read as ONNX"),
+    ("contract act --dataset foreign-words", "mavbridge.toml cannot be read"),
     ("demonstrate --out /proc/none --episodes 1", "--out /proc/none"),
     ("demonstrate --out new --seed 100", "--seed must be between 0 and"),
     ("demonstrate --out new --solve-time 100", "solve time: the expert has none"),
@@ -144,6 +145,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_meta(folder / "foreign", format="something else")
     (folder / "empty").mkdir()
     (folder / "left.unfinished").mkdir()
+    for name, text in (
+        ("act/config.json", b"{}"),
+        ("foreign-words/meta/info.json", b"{}"),
+        ("foreign-words/mavbridge.toml", "Flüge".encode("latin-1")),
+    ):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(text)
     (folder / "broken.onnx").write_bytes(b"not a graph")
     (folder / "foreigners/000000").mkdir(parents=True)
     (folder / "foreigners/000000/thesis.tex").write_text("years of work")
