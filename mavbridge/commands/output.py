@@ -16,6 +16,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable, write_output
 from mavbridge.core.provenance import without_secrets
@@ -23,6 +24,7 @@ from mavbridge.observe.output import SafeConsole
 
 PIPED_WIDTH = 120
 """Columns of the tables if there is no terminal."""
+PICTURES = (".png", ".svg", ".pdf")
 INK, MUTED, GRID, GREY = "#1f2933", "#6b7885", "#dfe4ea", "#a9b4bf"
 BLUE, RED = "#2b6cb0", "#d1495b"
 FIGURE_DPI = 150
@@ -49,8 +51,10 @@ def require_outputs(json_file: Path | None, plot: Path | None) -> None:
     """Check the flags ``--json`` and ``--plot`` before a long run.
 
     Raises:
-        UserError: a file cannot be written, or matplotlib is not installed.
+        UserError: a file cannot be written or is no picture, or matplotlib is not installed.
     """
+    if plot is not None and plot.suffix not in PICTURES:
+        raise UserError(f"--plot {plot}: name a file that ends in {', '.join(PICTURES)}")
     require_writable(json_file, "--json")
     require_writable(plot, "--plot")
     if plot is not None:

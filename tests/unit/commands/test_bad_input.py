@@ -93,6 +93,7 @@ BAD = [
     ("inspect flight --html /dev/full", "cannot write --html /dev/full"),
     ("inspect nowhere --rerun nonsense", "--rerun"),
     ("inspect [a]", "no folder [a]"),
+    ("replay flight --plot sticks.txt", "name a file that ends in .png"),
     (RECORD, "name the vehicle: --connect"),
     (f"{RECORD} --connect udp:nowhere", "udp:nowhere"),
     (f"{LISTEN} --camera none", "nothing to learn from without images"),
