@@ -28,9 +28,9 @@ HELD_OUT_COURSE_SEED = 1_000_000
 """First seed of the evaluation's courses; nothing is ever trained on them."""
 
 MAX_EPISODES = 10_000
+"""Most episodes per evaluation, so that different seeds never share courses."""
 _EXPERTS = ("seed", "image_size", "dual_rate")
 """Settings of a policy that a demonstration uses without a student, or checks itself."""
-"""Most episodes per evaluation, so that different seeds never share courses."""
 
 MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
 """Beyond this seed, easy courses would be race courses, some of them trained on."""
