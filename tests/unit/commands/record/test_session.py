@@ -1,9 +1,14 @@
+"""The guard that listens, the pilot's view of the vehicle, and the status line."""
+
 import io
 import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -11,14 +16,34 @@ from rich.console import Console
 from helpers.factories import make_guard_tick, make_plan, make_tick
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
+from mavbridge.commands.config import ListenConfig, RecordConfig
+from mavbridge.commands.record.run import CONTRACT, listening_guard, pilot_flight
 from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, Shown
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
+from mavbridge.flight.plan import plan_flight
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.wire import GuardStatus, Packets
 from mavbridge.mavlink.codec.tlog import PacketPipe
+
+
+def test_the_guard_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_path: Path) -> None:
+    config = RecordConfig(out=tmp_path, vehicle=ListenConfig(connect="udp:x:1"), rate=50.0)
+    guard = listening_guard(config, MonotonicClock())
+    assert guard.link.readonly
+    assert (guard.link.pilot_hz, guard.link.state_hz) == (50.0, 50.0)
+    flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).guard
+    assert flight.engagement.readonly
+    assert flight.stick_period_ns == NS_PER_S // 50
+    assert flight.meaning.stick_gains is not None, "the vehicle's sticks in a policy's terms"
+
+
+def test_no_network_is_loaded_to_record() -> None:
+    code = "import sys, mavbridge.commands.record.run; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
 
