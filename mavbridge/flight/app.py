@@ -195,13 +195,13 @@ class _Flight:
         """Outcome of the policy's flight; None if the policy never flew."""
         if not self._observers.referee.has_flown:
             return None
-        summary, asked = self._guard.summary, self._ending
+        summary, asked, referee = self._guard.summary, self._ending, self._observers.referee
         end: FlightEnd = "fault" if asked.is_fault else asked.end
-        if summary is not None and summary.outcome.end is not None:
-            end = summary.outcome.end
-        elif self._observers.referee.is_taken:  # the guard died after the flight
-            end = "takeover"
-        return self._observers.referee.outcome(end, self._bridge.view.status, asked.reason)
+        if summary is not None:
+            end = summary.outcome.end or end
+        elif referee.reason not in (None, asked.reason):  # the guard died after the flight
+            end = referee.end
+        return referee.outcome(end, self._bridge.view.status, asked.reason)
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
         config = self._config.camera
@@ -241,7 +241,6 @@ class _Flight:
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = not self._config.link.readonly and keyboard.start()
         screen.start(hint=KEYS_HINT if has_keys else None)
-        ending = EndRequest(reason=because(Code.SIGNAL))
         referee = self._observers.referee
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
@@ -251,6 +250,9 @@ class _Flight:
                 ending = over
                 break
             stop.wait(1 / STATUS_HZ)
+        else:
+            has_died = self._guard.summary is None and not stop.is_set()
+            ending = self._ending if has_died else EndRequest(reason=because(Code.SIGNAL))
         self._end(ending, listener, stop)
 
     def _on_key(self, key: str) -> None:

@@ -79,7 +79,8 @@ class FlightReferee:
         self._flown: Tick | None = None
         """Last tick in which the policy had control."""
         self._has_position = self._is_flying = False
-        self._reason: Reason | None = None
+        self.reason: Reason | None = None
+        """Why the policy's last flight ended; None while it flies."""
 
     def emit(self, event: Event) -> None:
         """Follow the ticks from the policy's first action on."""
@@ -90,10 +91,10 @@ class FlightReferee:
         was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING.value
         if self._is_flying:
             self._began_ns = self._began_ns or event.sent_ns
-            self._flown, self._reason = event, None
+            self._flown, self.reason = event, None
             self._has_position = self._has_position or event.position_ned_m is not None
         elif was_flying:
-            self._reason = event.release_reason
+            self.reason = event.release_reason
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
             self._crashes.see(event)
@@ -104,9 +105,12 @@ class FlightReferee:
         return self._flown is not None
 
     @property
-    def is_taken(self) -> bool:
-        """True if the pilot has ended the policy's last flight."""
-        return self._reason is not None and self._reason.kind is Kind.PILOT
+    def end(self) -> FlightEnd:
+        """How the policy's last flight ended, by its reason alone."""
+        if self.reason is None:
+            return "fault"
+        taken: FlightEnd = "takeover" if self.reason.kind is Kind.PILOT else "fault"
+        return next((end for end in _ENDS if end == self.reason.code), taken)
 
     @property
     def crash(self) -> str | None:
@@ -140,7 +144,7 @@ class FlightReferee:
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
             end=end,
-            reason=asked if self._reason is None else self._reason,
+            reason=self.reason or asked,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
             speed_mps=None if state is None else state.speed_mps,

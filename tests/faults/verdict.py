@@ -8,6 +8,7 @@ from faults.record import Aftermath, Ending, VehicleReport, aftermath, ending
 from faults.relay import Sent
 from faults.scenario import Scenario, Variant
 from faults.stage import Stage
+from mavbridge.core.errors import ExitCode
 
 MOST_IMPACT_MPS = 1.0
 """Both firmwares touch down at 0.5 to 0.7 m/s (LAND_SPEED, MPC_LAND_SPEED)."""
@@ -88,6 +89,8 @@ def judge(
 def _wrong(verdict: Verdict, report: VehicleReport, sent: list[Sent]) -> Iterator[str]:
     if "Traceback" in verdict.output:
         yield "it prints a traceback"
+    if verdict.exit == ExitCode.FAULT and "ended by a signal" in verdict.output:
+        yield "it ended by a fault, and blames a signal"
     if report["refused_messages"]:
         yield f"the vehicle refused {report['refused_messages']} messages"
     if wild := [row.message for row in sent if not row.is_within_limits]:

@@ -195,14 +195,29 @@ def test_a_second_flight_has_a_reason_of_its_own() -> None:
     taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
     first = [*course_ticks(50), make_released_tick(51, taken, phase="released")]
     referee = FlightReferee(None)
-    for ticks, is_taken in ((first, True), (course_ticks(50), False)):
+    for ticks, end in ((first, "takeover"), (course_ticks(50), "fault")):
         for tick in ticks:
             referee.emit(tick)
-        assert referee.is_taken is is_taken
+        assert referee.end == end
     outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED))
     assert outcome is not None
     assert outcome.reason == because(Code.GUARD_DIED)
     assert "now armed in an unknown mode: " in describe(replace(outcome, mode=None))  # rebooted
+
+
+@pytest.mark.parametrize(
+    ("code", "end"),
+    [
+        *((code, code.value) for code in (Code.OPERATOR, Code.DURATION, Code.LANDED, Code.SIGNAL)),
+        *((Code.DISARMED, "disarmed"), (Code.OVERRIDE_SWITCH_OFF, "takeover")),
+        *((Code.POLICY_FAILED, "fault"), (Code.CONNECTION_LOST, "fault")),
+    ],
+)
+def test_without_a_summary_the_reason_tells_the_end(code: Code, end: FlightEnd) -> None:
+    referee = FlightReferee(None)
+    for tick in (*course_ticks(50), make_released_tick(51, because(code), phase="leaving")):
+        referee.emit(tick)
+    assert referee.end == end
 
 
 def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:
