@@ -8,7 +8,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, Memory, not_engaged
 from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
-from mavbridge.guard.table import PROGRESS, TABLE, Transition, ended, objection
+from mavbridge.guard.table import PROGRESS, TABLE, Transition, duration_over, objection
 from mavbridge.guard.values import (
     Actions,
     ControlSource,
@@ -124,8 +124,9 @@ class Engagement(Memory):
 
     def _watch(self, now: EngagementInputs) -> Actions:
         """Read-only: run the policy whenever it could fly; the link sends nothing."""
-        if ended(self, now):
-            self.phase = Phase.ENDED
+        if (cause := self.end_request or duration_over(self, now)) is not None:
+            self._note_end(cause)
+            self.phase, self.reason = Phase.ENDED, cause.reason
             return Actions()
         problem = objection(self, now)
         if self.starting_ns is None:

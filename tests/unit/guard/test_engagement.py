@@ -333,6 +333,7 @@ def test_watching_ends_as_a_flight_does(ends: str) -> None:
     assert set(stepped.run(1)) == {FLIES}
     assert stepped.step(stop=DEATH if ends == "stop" else None) == NOTHING
     assert stepped.phase is Phase.ENDED
+    assert stepped.engagement.outcome.end == ("fault" if ends == "stop" else ends)
 
 
 # --- last words
