@@ -8,11 +8,12 @@ import hashlib
 import re
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from gc import get_referents
 from io import IOBase
 from itertools import count, islice
-from types import SimpleNamespace
+from types import MemberDescriptorType, SimpleNamespace
 
 import numpy as np
 import torch
@@ -27,7 +28,8 @@ WARM_UP_CALLS = 3
 """Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
 MAX_HELD = 10_000
 """Largest number of objects that are searched for a policy's modules and memory."""
-_OPENED = (list, tuple, dict, SimpleNamespace, nn.Module)
+_COLLECTIONS = (list, tuple, dict, set, frozenset, deque, partial)
+_OPENED = (*_COLLECTIONS, SimpleNamespace, nn.Module)
 """Types that are searched beside those of packages outside ``_LIBRARIES``."""
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
 _OF_TORCH = frozenset(vars(nn.Module()))
@@ -159,18 +161,21 @@ def _is_of_user(kind: type) -> bool:
 
 
 def _attributes(holder: object) -> dict[str, object]:
-    """Return the elements of a collection, or the attributes of an object and of its class."""
-    if isinstance(holder, list | tuple | dict):
-        items = holder.items() if isinstance(holder, dict) else enumerate(holder)
-        return {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
+    """Return the elements of a collection, and the attributes of an object and of its class."""
+    items: Iterable[tuple[object, object]] = ()
+    if isinstance(holder, _COLLECTIONS):
+        items = holder.items() if isinstance(holder, dict) else enumerate(get_referents(holder))
+    elements = {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
     attributes: dict[str, object] = {}
     for kind in filter(_is_of_user, reversed(type(holder).__mro__)):
         attributes |= vars(kind)
+    slots = [name for name, each in attributes.items() if isinstance(each, MemberDescriptorType)]
+    attributes |= {name: getattr(holder, name, None) for name in slots}
     attributes |= getattr(holder, "__dict__", {})
     if isinstance(holder, nn.Module):
         attributes = {name: each for name, each in attributes.items() if name not in _OF_TORCH}
         attributes |= {**dict(holder.named_buffers(recurse=False)), **dict(holder.named_children())}
-    return {f".{name}": value for name, value in attributes.items()}
+    return elements | {f".{name}": value for name, value in attributes.items()}
 
 
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:

@@ -1,6 +1,9 @@
 """Torch policies as a user might write them, small and untrained."""
 
 import itertools
+from collections import deque
+from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,11 +83,12 @@ class PlainClass:
 
 
 class Listed(PlainClass):
-    """Holds a module in a list, and one in TorchScript."""
+    """Holds a module in a partial in a deque, and one in TorchScript."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.heads, self.visual_encoder = [self.head], torch.jit.script(self.visual_encoder)
+        self.visual_encoder = torch.jit.script(self.visual_encoder)
+        self.heads = deque([partial(self.head)])
         del self.head
 
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
@@ -130,6 +134,19 @@ class CountingBelow(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         self.phases[0].calls = next(self.clock)
         return super().predict_fast(feature, state, history, steps)
+
+
+@dataclass(slots=True)
+class Phase:
+    calls: int = 0
+
+
+class CountingInSlots(CountingBelow):
+    """Its memory is an object with slots in a deque, and an iterator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.phases: Any = deque([Phase()])
 
 
 class Deciding(TwoRates):
