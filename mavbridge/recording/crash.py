@@ -12,7 +12,8 @@ from policy.contract import QUATERNION
 OVERTURNED_NS = 500 * NS_PER_MS
 """Shortest time armed beyond 90 degrees of tilt that counts as a crash; a flip takes less."""
 FALL_NS = NS_PER_S
-"""Window after a disarming in which a fall must show: after 1 s of free fall, speed is 9.8 m/s."""
+"""Window after a disarming for a fall, which reaches 9.8 m/s in 1 s, and for a late crash message.
+Later ones are the checks before the next arming, such as "PreArm: CrashDump data detected"."""
 FALL_MPS = 1.5
 """Speed while disarmed that counts as a fall; a vehicle at rest reports less, any fall more."""
 _WORDS = ("crash", "flight termination", "lockdown")
@@ -33,18 +34,22 @@ class CrashWatch:
         self.reason: str | None = None
         self._over_since_ns: int | None = None
         self._was_armed = self._counts_falls = False
-        self._disarmed_ns: int | None = None
+        self._disarmed_ns = 0
 
     def see(self, tick: Tick) -> None:
         """Process one tick."""
         if tick.armed:  # the guard releases in the pass in which it sees a disarming
             is_ours = tick.phase in (None, "flying", "leaving")
             self._counts_falls = is_ours or tick.release_reason == _PILOTS
-        was_armed, fallen = self._was_armed, self._fallen(tick)
-        if self.reason is None and (self._counts_falls or was_armed or tick.armed):
+        was_armed, self._was_armed = self._was_armed, tick.armed
+        if was_armed and not tick.armed:
+            self._disarmed_ns = tick.woke_ns
+        is_soon = tick.woke_ns - self._disarmed_ns <= FALL_NS
+        may_fall = self._counts_falls and is_soon
+        if self.reason is None and (tick.armed or was_armed or may_fall):
             self.reason = self._said(tick) or self._overturned(tick)
-            if self._counts_falls:
-                self.reason = self.reason or fallen
+            if may_fall:
+                self.reason = self.reason or self._fallen(tick)
 
     def _said(self, tick: Tick) -> str | None:
         for text in map(recorded_text, tick.texts):
@@ -66,13 +71,6 @@ class CrashWatch:
         return "it lay on its back while armed" if is_long else None
 
     def _fallen(self, tick: Tick) -> str | None:
-        if self._was_armed and not tick.armed:
-            self._disarmed_ns = tick.woke_ns
-        self._was_armed = tick.armed
-        if self._disarmed_ns is None or tick.armed or tick.state is None:
+        if tick.armed or tick.state is None or tick.state.speed_mps < FALL_MPS:
             return None
-        is_soon = tick.woke_ns - self._disarmed_ns <= FALL_NS
-        speed_mps = tick.state.speed_mps
-        if not is_soon or speed_mps < FALL_MPS:
-            return None
-        return f"it was disarmed in the air, and moved at {speed_mps:.1f} m/s"
+        return f"it was disarmed in the air, and moved at {tick.state.speed_mps:.1f} m/s"

@@ -69,6 +69,11 @@ PILOTS = {"phase": "released", "release_reason": because(Code.PILOT_FLIES)}
         pytest.param(
             [(1.0, FLYING), (0.1, DISARMED), (0.1, SAID | DISARMED)], "said", id="told late"
         ),
+        pytest.param(
+            [(1.0, FLYING), (1.1, DISARMED | {"state": None}), (0.1, SAID | DISARMED)],
+            None,
+            id="told at rest",
+        ),
         pytest.param([(1.0, FLYING | TAKEN), (0.5, FALLING | TAKEN)], None, id="by a hand"),
         pytest.param(
             [(1.0, FLYING | PILOTS), (0.5, FALLING | PILOTS)], "disarmed in", id="a pilot's flight"
