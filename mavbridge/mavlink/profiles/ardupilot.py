@@ -50,14 +50,6 @@ _THRUST_AS_THRUST = 8
 _CONTINUE_LANDING = 8
 """Bit 3 of FS_OPTIONS."""
 
-_OLD_NAMES = {
-    "MAV_GCS_SYSID": "SYSID_MYGCS",
-    "ATC_ANGLE_MAX": "ANGLE_MAX",
-    "PILOT_SPD_UP": "PILOT_SPEED_UP",
-    "PILOT_SPD_DN": "PILOT_SPEED_DN",
-}
-"""Names since 4.7, with those up to 4.6."""
-
 _RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
 """Parameters that decide a flight's safety: requested again if the first requests get lost."""
 
@@ -68,8 +60,8 @@ _FIRST_NAMES = (
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER", "Q_ENABLE"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
-    *_OLD_NAMES,
-    *_OLD_NAMES.values(),
+    *("MAV_GCS_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "PILOT_SPD_DN"),
+    *("SYSID_MYGCS", "ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_SPEED_DN"),  # the same up to 4.6
     *(f"RC{number}_OPTION" for number in OPTION_CHANNELS),
 )
 """Parameters to read first; RCMAP_* then selects the RCn_MIN etc. to read."""
