@@ -13,7 +13,7 @@ from mavbridge.core.link_settings import LinkSettings, SigningFiles
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import AdviceText, Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamWrite
-from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT, ArduPilot
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.checks import serial_risks
 
@@ -160,19 +160,6 @@ def test_simple_mode_that_is_set_off_is_switched_off_as_well(
     assert vehicle.writes == list(wanted)
     assert [r for r in vehicle.requests if isinstance(r, CommandRequest)] == [off] * times
     assert vehicle.problem() is None
-
-
-def test_different_follow_ups_are_all_sent() -> None:
-    class TwoCommands(ArduPilot):
-        def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
-            return CommandRequest(len(name), (before, now)) if "SIMPLE" in name else None
-
-    names = ("SIMPLE", "SUPER_SIMPLE", "THR_DZ")
-    wanted = tuple((name, 0.0) for name in names)
-    vehicle = ParamVehicle(dict.fromkeys(names, 1.0), profile=TwoCommands(), set_params=wanted)
-    vehicle.run(10.0)
-    sent = [r.command for r in vehicle.requests if isinstance(r, CommandRequest)]
-    assert sorted(sent) == [6, 6, 6, 12, 12, 12]
 
 
 # --- changes after reading

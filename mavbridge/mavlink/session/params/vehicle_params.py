@@ -64,8 +64,9 @@ class VehicleParams:
         """What these parameters make of the vehicle."""
         self.changes = TemporaryParams(config.set_params, before=old_params, report=report)
         """Parameters that are set for the flight."""
-        self._follow_ups: dict[CommandRequest, tuple[int, int]] = {}
-        """Number of times still to send each command, and the time of the next [ns]."""
+        self._follow_up: CommandRequest | None = None
+        self._follow_ups_left = self._follow_up_ns = 0
+        """Number of times still to send this command, and the time of the next."""
         self._advised: ParamContext | None = None
         """Context of the last advice to the user."""
         self._assessed: Assessment | None = None
@@ -112,7 +113,7 @@ class VehicleParams:
             and param.name in dict(self._config.set_params)
             and (command := self._profile.follow_up(param.name, old, param.value)) is not None
         ):
-            self._follow_ups[command] = (_FOLLOW_UPS, 0)
+            self._follow_up, self._follow_ups_left, self._follow_up_ns = command, _FOLLOW_UPS, 0
         before, self._assessed = self._assessed, None
         after = self._current(status)
         is_armed = status is not None and status.armed
@@ -141,10 +142,9 @@ class VehicleParams:
                 is_disarmed=status is not None and not status.armed,
             ):
                 yield self._as_written(request)
-        for command, (left, due_ns) in list(self._follow_ups.items()):
-            if left and now_ns >= due_ns:
-                self._follow_ups[command] = (left - 1, now_ns + NS_PER_S)
-                yield command
+        if self._follow_up and self._follow_ups_left and now_ns >= self._follow_up_ns:
+            self._follow_ups_left, self._follow_up_ns = self._follow_ups_left - 1, now_ns + NS_PER_S
+            yield self._follow_up
 
     def _read(self, names: tuple[str, ...]) -> None:
         """Read these parameters if they are unknown, including ones that were given up before."""
