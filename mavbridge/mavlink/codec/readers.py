@@ -14,32 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.rotation import quaternion_from_euler
 from mavbridge.core.switch import RADIO_US
+from mavbridge.mavlink.codec import messages
 from mavbridge.mavlink.codec.frames import CURRENT_MODE, EVENT
-from mavbridge.mavlink.codec.messages import (
-    STICK_END,
-    Altitude,
-    Attitude,
-    AttitudeTarget,
-    AutopilotVersion,
-    Body,
-    CommandAck,
-    CurrentMode,
-    Endpoint,
-    EstimatorFlags,
-    Event,
-    Heartbeat,
-    LandedState,
-    LocalVelocity,
-    ManualControl,
-    ParamAbsent,
-    ParamValue,
-    RcChannels,
-    SpecificForce,
-    StatusText,
-    SystemStatus,
-    Timesync,
-    VelocityTarget,
-)
+from mavbridge.mavlink.codec.messages import STICK_END, Body, Endpoint
 
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, by standard gravity."""
@@ -81,14 +58,14 @@ def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body
         raise UnusableError
     w, x, y, z = quaternion
     unit = (w / norm, x / norm, y / norm, z / norm)
-    return Attitude(True, 1000 * m.time_boot_ms, unit, rate)
+    return messages.Attitude(True, 1000 * m.time_boot_ms, unit, rate)
 
 
 def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
     rate = (m.rollspeed, m.pitchspeed, m.yawspeed)
     _require_usable(m.roll, m.pitch, m.yaw, *rate)
     quaternion = quaternion_from_euler(m.roll, m.pitch, m.yaw)
-    return Attitude(False, 1000 * m.time_boot_ms, quaternion, rate)
+    return messages.Attitude(False, 1000 * m.time_boot_ms, quaternion, rate)
 
 
 def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
@@ -96,14 +73,16 @@ def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
     position = (m.x, m.y, m.z)
     is_position = all(abs(metres) <= MOST_VALUE for metres in position)  # also false for NaN
     velocity = (m.vx, m.vy, m.vz)
-    return LocalVelocity(1000 * m.time_boot_ms, velocity, position if is_position else None)
+    return messages.LocalVelocity(
+        1000 * m.time_boot_ms, velocity, position if is_position else None
+    )
 
 
 def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
     _require_usable(m.xacc, m.yacc, m.zacc)
     if m.fields_updated & _HIGHRES_ACCEL_FIELDS != _HIGHRES_ACCEL_FIELDS:
         raise UnusableError
-    return SpecificForce("HIGHRES_IMU", m.time_usec, (m.xacc, m.yacc, m.zacc))
+    return messages.SpecificForce("HIGHRES_IMU", m.time_usec, (m.xacc, m.yacc, m.zacc))
 
 
 def _milli_g_imu(
@@ -112,36 +91,36 @@ def _milli_g_imu(
     boot_us: int,
 ) -> Body:
     x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(name, boot_us, (x, y, z))
+    return messages.SpecificForce(name, boot_us, (x, y, z))
 
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
     channels_us = tuple(us if us in RADIO_US else 0 for us in _CHANNELS(m))
     # ArduPilot counts the receiver's channels, and also fills those that were overridden.
-    return RcChannels(channels_us[: max(m.chancount or 18, 8)], 1000 * m.time_boot_ms)
+    return messages.RcChannels(channels_us[: max(m.chancount or 18, 8)], 1000 * m.time_boot_ms)
 
 
 def _manual_control(m: dialect.MAVLink_manual_control_message) -> Body:
     if not (all(abs(value) <= STICK_END for value in (m.x, m.y, m.r)) and 0 <= m.z <= STICK_END):
         raise UnusableError  # 32767: the axis does not exist
-    return ManualControl(m.x, m.y, m.z, m.r)
+    return messages.ManualControl(m.x, m.y, m.z, m.r)
 
 
 def _sys_status(m: dialect.MAVLink_sys_status_message) -> Body:
     present = m.onboard_control_sensors_present & m.onboard_control_sensors_enabled
-    return SystemStatus(present, m.onboard_control_sensors_health, m.battery_remaining)
+    return messages.SystemStatus(present, m.onboard_control_sensors_health, m.battery_remaining)
 
 
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
     # The bytes of an integer may be those of NaN.
     if m.param_type == dialect.MAV_PARAM_TYPE_REAL32 and not math.isfinite(m.param_value):
         raise UnusableError
-    return ParamValue(name=_text(m.param_id), value=m.param_value, kind=m.param_type)
+    return messages.ParamValue(name=_text(m.param_id), value=m.param_value, kind=m.param_type)
 
 
 def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
     is_absent = m.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
-    return ParamAbsent(_text(m.param_id)) if is_absent else None
+    return messages.ParamAbsent(_text(m.param_id)) if is_absent else None
 
 
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
@@ -150,30 +129,30 @@ def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
     ended = text.rstrip("\t") if is_full else text.rstrip()  # PX4 ends its texts with a tab
     # Make terminal control codes visible.
     text = "".join(c if c.isprintable() else UNPRINTABLE for c in ended)
-    return StatusText(text, m.id, m.chunk_seq, is_full)
+    return messages.StatusText(text, m.id, m.chunk_seq, is_full)
 
 
 def _attitude_target(m: dialect.MAVLink_attitude_target_message) -> Body | None:
     q, rate = tuple(m.q), (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
     if not math.isfinite(sum((*q, *rate, m.thrust))):
         return None  # no target
-    return AttitudeTarget(rate, m.thrust)
+    return messages.AttitudeTarget(rate, m.thrust)
 
 
 def _velocity_target(m: dialect.MAVLink_position_target_local_ned_message) -> Body | None:
     velocity = (m.vx, m.vy, m.vz)
     if not math.isfinite(sum(velocity)):
         return None  # no target
-    return VelocityTarget(m.type_mask, velocity)
+    return messages.VelocityTarget(m.type_mask, velocity)
 
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
     v = m.flight_sw_version
-    return AutopilotVersion(f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
+    return messages.AutopilotVersion(f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
 
 
 READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
-    "HEARTBEAT": lambda m: Heartbeat(
+    "HEARTBEAT": lambda m: messages.Heartbeat(
         m.type, m.autopilot, m.base_mode, m.custom_mode, m.system_status
     ),
     "ATTITUDE": _attitude,
@@ -187,22 +166,22 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "MANUAL_CONTROL": _manual_control,
     "ATTITUDE_TARGET": _attitude_target,
     "POSITION_TARGET_LOCAL_NED": _velocity_target,
-    "GLOBAL_POSITION_INT": lambda m: Altitude(
+    "GLOBAL_POSITION_INT": lambda m: messages.Altitude(
         m.alt / 1000, m.relative_alt / 1000, 1000 * m.time_boot_ms
     ),
-    "CURRENT_MODE": lambda m: CurrentMode(m.custom_mode, m.intended_custom_mode),
-    "EVENT": lambda m: Event(m.id),
+    "CURRENT_MODE": lambda m: messages.CurrentMode(m.custom_mode, m.intended_custom_mode),
+    "EVENT": lambda m: messages.Event(m.id),
     "SYS_STATUS": _sys_status,
-    "EXTENDED_SYS_STATE": lambda m: LandedState(m.landed_state),
-    "EKF_STATUS_REPORT": lambda m: EstimatorFlags(m.flags),
-    "ESTIMATOR_STATUS": lambda m: EstimatorFlags(m.flags),
-    "COMMAND_ACK": lambda m: CommandAck(
+    "EXTENDED_SYS_STATE": lambda m: messages.LandedState(m.landed_state),
+    "EKF_STATUS_REPORT": lambda m: messages.EstimatorFlags(m.flags),
+    "ESTIMATOR_STATUS": lambda m: messages.EstimatorFlags(m.flags),
+    "COMMAND_ACK": lambda m: messages.CommandAck(
         m.command, m.result, Endpoint(m.target_system, m.target_component)
     ),
     "PARAM_VALUE": _param_value,
     "PARAM_ERROR": _param_error,
     "STATUSTEXT": _status_text,
-    "TIMESYNC": lambda m: Timesync(tc1=m.tc1, ts1=m.ts1),
+    "TIMESYNC": lambda m: messages.Timesync(tc1=m.tc1, ts1=m.ts1),
     "AUTOPILOT_VERSION": _autopilot_version,
 }
 """Reader of each MAVLink message that the bridge uses; raises UnusableError."""
