@@ -126,7 +126,11 @@ def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
     try:
         with safe_open(path, framework=framework) as file:
             yield file
-    except (OSError, SafetensorError, TypeError) as error:
+    except (TypeError, AttributeError) as error:  # NumPy has no bfloat16 and no float8
+        raise CheckpointError(
+            f"{path} holds numbers of a type that {framework} lacks ({error}): save them as float32"
+        ) from error
+    except (OSError, SafetensorError) as error:
         raise CheckpointError(why_unreadable(path, error)) from error
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file, save_file
+from safetensors.torch import save_file as save_tensors
 
 from policy.adapters.lerobot.plan import read_plan
 from policy.errors import CheckpointError, ContractError, PolicyError
@@ -189,6 +191,11 @@ def test_processors_that_are_not_supported_are_refused(folder):
         save_file(load_file(path) | {key: np.zeros(size, np.float32)}, path)
         with pytest.raises(CheckpointError, match=rf"must have \d+ numbers, got .*: {size}"):
             read_plan(folder, None)
+    for kind in (torch.bfloat16, torch.float8_e4m3fn):
+        save_tensors({"observation.state.min": torch.zeros(13).to(kind)}, path)
+        with pytest.raises(CheckpointError, match="of a type that numpy lacks .*: save them as fl"):
+            read_plan(folder, None)
+    shutil.copy(GOLDENS / "diffusion" / STATISTICS, path)
     step = {"registry_name": "relative_actions_processor", "config": {}}
     edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
     with pytest.raises(CheckpointError, match="relative_actions_processor"):
