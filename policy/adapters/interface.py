@@ -150,7 +150,7 @@ class Interface:
     def to_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
         """Convert the policy's actions [..., 4] to the contract's [..., 4], arrays or tensors."""
         values: Any = actions
-        if values.shape[-1] != ACTION_DIM:
+        if tuple(values.shape[-1:]) != (ACTION_DIM,):
             raise PolicyError(
                 f"its chunk is {list(values.shape)}, and its last axis must be the {ACTION_DIM} "
                 "numbers of an action"

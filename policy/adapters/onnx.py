@@ -3,7 +3,7 @@
 import hashlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -48,10 +48,10 @@ class RoleGraph:
     """Compiled graph with its hidden state, zeros at first; for one thread."""
 
     def __init__(
-        self, graph: Graph, roles: list[str], hidden: Mapping[str, Shape], *, has_scalar_time: bool
+        self, graph: Graph, shapes: Mapping[str, Sequence[int]], hidden: Mapping[str, Shape]
     ) -> None:
-        self._graph, self._roles, self._hidden_shapes = graph, roles, hidden
-        self._has_scalar_time = has_scalar_time
+        """Take a compiled graph, the shape of each input by role, in order, and the hidden ones."""
+        self._graph, self._shapes, self._hidden_shapes = graph, shapes, hidden
         self.reset()
 
     def reset(self) -> None:
@@ -62,9 +62,7 @@ class RoleGraph:
     def __call__(self, **arrays: FloatArray) -> FloatArray:
         """Run the graph on float32 arrays by role; arrays that it does not take are ignored."""
         given = arrays | self._hidden if self._hidden else arrays
-        if self._has_scalar_time:
-            given = {**given, "timestep": given["timestep"].reshape(())}
-        result = self._graph(*[given[role] for role in self._roles])
+        result = self._graph(*[given[role].reshape(s) for role, s in self._shapes.items()])
         if self._hidden:
             self._hidden = dict(zip(self._hidden, self._graph.rest(), strict=True))
         return result
@@ -116,6 +114,12 @@ class GraphFile:
             [port.get_node().input_value(0) for port in kept], model.get_parameters(), "policy"
         )
         self._make_static({role: each.shape for role, each in inputs.items()} | self.hidden)
+        for port in self._model.outputs:
+            if (shape := port.get_partial_shape()).is_dynamic:
+                raise CheckpointError(
+                    f"{path}: an output has the shape {shape}, which depends on the values of the "
+                    "inputs: export a graph whose outputs have one size"
+                )
         self.output_shape = tuple(self._model.outputs[0].shape)
 
     @signal_stack_kept()
@@ -128,8 +132,7 @@ class GraphFile:
         shapes = [list(port.shape) for port in self._model.inputs]
         subject = f"{_digest(self._path, self._model)} {shapes} {self._kept}"
         graph = compile_graph(subject, precision, lambda: self._model)
-        has_scalar_time = dict(zip(self.roles, shapes, strict=True)).get("timestep") == []
-        return RoleGraph(graph, self.roles, self.hidden, has_scalar_time=has_scalar_time)
+        return RoleGraph(graph, dict(zip(self.roles, shapes, strict=True)), self.hidden)
 
     def _hidden_pairs(self, model: "ov.Model", given: Mapping[str, str]) -> dict[str, str]:
         """Return the output that feeds each hidden input at the next call, by name."""
@@ -228,7 +231,8 @@ class GraphFile:
             sizes = list(declared) if declared.rank.is_static else []
             is_reshaped = role != "image" and 0 < len(sizes) != len(shapes[port])
             if is_reshaped and math.prod(_sizes(port)[1:]) == math.prod(shapes[port][1:]):
-                continue  # the same numbers, flat or with more axes; reshape fails on others
+                shapes[port] = list(_sizes(port))  # the same numbers, flat or with more axes
+                continue
             axes = zip(reversed(sizes), reversed(shapes[port][1:]), strict=False)  # no batch
             if any(axis.is_static and axis.get_length() != size for axis, size in axes):
                 raise CheckpointError(
