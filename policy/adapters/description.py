@@ -35,8 +35,11 @@ RESULTS = ("chunk", "feature", "prediction")
 TABLES = ("contract", "schedule", "inputs", "outputs", "hidden")
 ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "policy.onnx"
 KINDS = f"{ENCODER} and {DENOISER}, {ENCODER} and {HEAD}, or {WHOLE} alone"
-_EXTERNAL = re.compile(r"externally stored data in file \((.+), offset: ")
+_EXTERNAL = re.compile(
+    r"(?:externally stored data in file \(|data_full_path: )(.+), offset: ", re.S
+)
 """In an error of OpenVINO: the file whose external weights are missing."""
+_MISMATCH = "size of the external data file does not match"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,20 +186,34 @@ def read_graph(path: Path) -> "ov.Model":
     try:
         loaded = reader.load(str(path))
     except failures as error:
-        if (found := _EXTERNAL.search(str(error))) is None:
-            raise CheckpointError(why_unreadable(path, error, "ONNX")) from error
-        beside = path.parent / found[1]
-        what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
-        raise CheckpointError(
-            f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"
-        ) from error
+        said = _lacking(path, error) or why_unreadable(path, error, "ONNX")
+        raise CheckpointError(said) from error
     try:
         model: ov.Model = reader.convert(loaded)
     except failures as error:
-        raise CheckpointError(
+        said = _lacking(path, error) or (
             f"{path} holds what OpenVINO cannot run ({last_line(error)}): export it with operators "
             "of the ONNX standard alone, and without errors of onnx.checker"
-        ) from error
+        )
+        raise CheckpointError(said) from error
     if not model.outputs:
         raise CheckpointError(why_unreadable(path, ValueError("there is no graph in it"), "ONNX"))
     return model
+
+
+def _lacking(path: Path, error: Exception) -> str | None:
+    """Return what is wrong with a graph's external weights if that is why it was not read."""
+    if (found := _EXTERNAL.search(str(error))) is not None:
+        beside = path.parent / found[1]
+        what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
+        return f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"
+    if _MISMATCH not in str(error):
+        return None
+    others = (each for each in sorted(path.parent.iterdir()) if each != path and each.is_file())
+    for beside in others:
+        if (stands_in := stand_in(beside)) is not None:
+            return f"{beside}, beside {path.name}, is {stands_in[0]}: {stands_in[1]}"
+    return (
+        f"{path.parent}: the file with the weights of {path.name} is cut short, or of another "
+        f"export ({last_line(error)}): copy both files again"
+    )

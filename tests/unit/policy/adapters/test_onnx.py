@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
 
+import onnx
 from onnx import TensorProto, helper
 
 from helpers import foreign_graphs as graphs
@@ -227,6 +228,22 @@ def test_a_timestep_without_axes_is_taken(tmp_path: Path) -> None:
     assert act(load(f"onnx:{tmp_path}", num_diffusion_steps=1).runner)[0, 0] in (-1, 1)
 
 
+@pytest.mark.parametrize("dim", [1, "n"])
+def test_a_history_that_is_declared_flat_is_given_flat(tmp_path: Path, dim: int | str) -> None:
+    graphs.write_contract(tmp_path)
+    weight = np.full((16, 4), 0.5, np.float32)
+    nodes = [
+        helper.make_node("Cos", ["action_history"], ["ones"]),
+        helper.make_node("MatMul", ["ones", "w"], ["actions"]),
+    ]
+    inputs, outputs = (
+        {"action_history": (graphs.FLOAT, (dim, 16))},
+        {"actions": (graphs.FLOAT, ("n", "m"))},
+    )
+    graphs.save_graph(tmp_path / "policy.onnx", nodes, inputs, outputs, {"w": weight})
+    assert act(fly(f"onnx:{tmp_path}")).tolist() == [[8.0] * 4]
+
+
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
 def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.write_contract(tmp_path)
@@ -254,6 +271,27 @@ def external(folder: Path, change: Callable[[Path], object]) -> None:
 
 def pointer(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 208\n")
+
+
+def external_without_length(folder: Path, change: Callable[[Path], object]) -> None:
+    """As ``external``; the entry "length" of the weights, which is optional, is left out."""
+    external(folder, change)
+    model = onnx.load(folder / "policy.onnx", load_external_data=False)
+    for each in model.graph.initializer:
+        kept = [entry for entry in each.external_data if entry.key == "location"]
+        del each.external_data[:]
+        each.external_data.extend(kept)
+    (folder / "policy.onnx").write_bytes(model.SerializeToString())
+
+
+def nonzero(folder: Path) -> None:
+    """Write obs [1, 13] -> the indices of its numbers other than 0, as many as there are."""
+    nodes = [
+        helper.make_node("NonZero", ["obs"], ["indices"]),
+        helper.make_node("Cast", ["indices"], ["actions"], to=graphs.FLOAT),
+    ]
+    inputs, outputs = {"obs": (graphs.FLOAT, STATE)}, {"actions": (graphs.FLOAT, ("n", "m"))}
+    graphs.save_graph(folder / "policy.onnx", nodes, inputs, outputs, {})
 
 
 def one_node(
@@ -298,6 +336,19 @@ REFUSED: dict[str, tuple[Write, str]] = {
         lambda folder: external(folder, pointer),
         r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
     ),
+    "external data of no length missing": (
+        lambda folder: external_without_length(folder, Path.unlink),
+        r"policy\.onnx\.data, .* is missing or cut short: copy both",
+    ),
+    "external data of no length cut": (
+        lambda folder: external_without_length(folder, lambda data: os.truncate(data, 100)),
+        r"the weights of policy\.onnx is cut short, .*copy both",
+    ),
+    "external data of no length a pointer": (
+        lambda folder: external_without_length(folder, pointer),
+        r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
+    ),
+    "output of no one size": (nonzero, r"has the shape \[2,\.\.13\], which depends on the values"),
     "integer actions": (
         lambda folder: graphs.actor(folder / "policy.onnx", action_type=TensorProto.INT64),
         r"chunk is of type i64",
