@@ -193,7 +193,9 @@ def test_processors_that_are_not_supported_are_refused(folder):
             read_plan(folder, None)
     for kind in (torch.bfloat16, torch.float8_e4m3fn):
         save_tensors({"observation.state.min": torch.zeros(13).to(kind)}, path)
-        with pytest.raises(CheckpointError, match="of a type that numpy lacks .*: save them as fl"):
+        with pytest.raises(
+            CheckpointError, match=r"of a type that numpy lacks .*: save them as fl"
+        ):
             read_plan(folder, None)
     shutil.copy(GOLDENS / "diffusion" / STATISTICS, path)
     step = {"registry_name": "relative_actions_processor", "config": {}}
