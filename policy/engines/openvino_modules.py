@@ -48,9 +48,11 @@ _READS = frozenset(
     (
         *("__bool__", "__int__", "__float__", "__index__", "__contains__", "__array__"),
         *("item", "tolist", "numpy", "equal", "allclose", "is_nonzero"),
+        *("nonzero", "argwhere", "masked_select", "unique", "unique_consecutive", "bincount"),
     )
 )
-"""Functions that give Python the value of a tensor; a trace would silently freeze it."""
+"""Functions that give Python the value of a tensor, or a size that depends on values; a trace would
+silently freeze it."""
 MAX_OPERATIONS = 4000
 """Largest number of operations in one graph, 3 ms each to convert; ten unrolled steps of a TOGE are
 2,700, one is 500."""
@@ -219,7 +221,11 @@ class _Undecided(TorchFunctionMode):
     ) -> Any:
         is_list = func is torch.as_tensor and isinstance(next(iter(args), None), list)
         copied = tree_leaves((args, kwargs)) if is_list or func is torch.tensor else []
-        if any(isinstance(each, Tensor) for each in copied) or func.__name__ in _READS:
+        index = tree_leaves(args[1:]) if func.__name__ == "__getitem__" else []
+        masks = [i for i in index if isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8)]
+        is_search = func.__name__ == "where" and len(args) + len(kwargs or ()) == 1
+        is_read = masks or is_search or func.__name__ in _READS
+        if is_read or any(isinstance(each, Tensor) for each in copied):
             raise PolicyError(_DECIDES)
         return func(*args, **(kwargs or {}))
 

@@ -197,6 +197,18 @@ class ScriptedDeciding(Scripted):
     predict_fast = Deciding.predict_fast
 
 
+class ScriptedSelecting(Scripted):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return -chunk if len(state[state[:, 2] > 100]) else chunk
+
+
+class ScriptedSearching(Scripted):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return -chunk if len(torch.where(state > 100)[0]) else chunk
+
+
 class Drawing(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         chunk = super().predict_fast(feature, state, history, steps)

@@ -52,6 +52,8 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("Reading", "it decides by the values of a tensor"),
         ("ReadingWritten", "it decides by the values of a tensor"),
         ("ScriptedDeciding", "it decides by the values of a tensor"),
+        ("ScriptedSelecting", "it decides by the values of a tensor"),
+        ("ScriptedSearching", "it decides by the values of a tensor"),
         ("Looping", "its graph has 1.. operations, and at most 90"),
     ],
 )
