@@ -161,6 +161,9 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     tick_ns, sent_ns = _decisions(name, ticks), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
     sent, target, is_target = _sticks(name, ticks, contract)
+    # An action that the link refused does not fly: the one before it does.
+    is_refused = (np.array(ticks["phase"]) == "flying") & ~_known(sent)
+    flew = np.maximum.accumulate(np.where(is_refused, 0, np.arange(len(sent))))
     # The expert observed at the policy's tick; its stick is for that time.
     target_ns = stamps(name, ticks, "woke_ns") if "expert" in ticks.column_names else sent_ns
     if contract.action == "rates":
@@ -177,7 +180,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
-        sent=np.nan_to_num(sent, nan=0.0),
+        sent=np.nan_to_num(sent[flew], nan=0.0),
         contract=contract,
         course_seed=course_seed if isinstance(course_seed, int) else None,
         age_ns=_ages(name, ticks),

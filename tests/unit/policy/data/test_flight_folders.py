@@ -113,11 +113,13 @@ def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path)
 def test_only_what_the_policy_flew_is_imitated_not_the_guards_neutral_sticks(
     tmp_path: Path,
 ) -> None:
-    neutral, phases = (0.0,) * 4, ["preparing", "flying", "holding"]
-    folder = flight(tmp_path / "a", expert=None, sent=[neutral, STICK, neutral], phase=phases)
+    neutral, phases = (0.0,) * 4, ["preparing", "flying", "flying", "holding", "released"]
+    sent = [neutral, STICK, None, neutral, None]  # the third was refused, so the second flies on
+    woke_ns = [*WOKE, 30 * MS, 40 * MS]
+    folder = flight(tmp_path / "a", expert=None, woke_ns=woke_ns, sent=sent, phase=phases)
     episode = read_flight(folder)
     assert episode.target_ns.tolist() == WOKE[1:2]
-    np.testing.assert_allclose(episode.sent, [neutral, STICK, neutral])
+    np.testing.assert_allclose(episode.sent, [neutral, STICK, STICK, neutral, neutral])
 
 
 def test_a_pilots_sticks_are_imitated_in_modes_of_the_contract(tmp_path: Path) -> None:
