@@ -228,7 +228,7 @@ class Code(StrEnum):
     )
     CHUNKS_RESUMED = _waiting(
         "chunks have just resumed after a gap of {gap_ms:.0f} ms (limit {bridged_ms:.0f} ms): "
-        "engage again"
+        "wait for steady chunks"
     )
     NO_CHUNK = _waiting("no chunk from the policy yet")
     NOT_RECORDED = _fault("the recording lacks {what}")
