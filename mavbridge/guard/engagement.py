@@ -170,6 +170,8 @@ class Engagement(Memory):
         is_armed_first = self._is_armed_first(now) and self.settings.engage_on_arm
         is_act = self._is_switched_on(now) or is_armed_first
         self.act = act or ("engage" if is_act else None)
+        if self.act == "engage":
+            self.refusal = None  # of another source's act in this step
 
     def _is_armed_first(self, now: EngagementInputs) -> bool:
         """True if a vehicle that was seen disarmed is seen armed for the first time.

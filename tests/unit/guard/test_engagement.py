@@ -132,6 +132,12 @@ def test_a_vehicle_that_is_found_armed_was_not_armed_for_us(found_ns: int) -> No
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=UNSEEN)
 
 
+def test_an_act_in_the_step_in_which_an_armed_vehicle_is_found_engages() -> None:
+    stepped = Stepped(AIRBORNE, engage_on_arm=True)
+    assert stepped.step("engage") == FLIES
+    assert stepped.engagement.refusal is None
+
+
 @pytest.mark.parametrize(
     ("seconds", "unheard"),
     [(0.3, ("heard_ns", "mode_arrived_ns")), (2.9, ()), (3.1, ())],
