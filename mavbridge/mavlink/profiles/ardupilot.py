@@ -47,6 +47,8 @@ _IGNORE_RECEIVER, _IGNORE_OVERRIDES = 1, 2
 """Bits 0 and 1 of RC_OPTIONS."""
 _THRUST_AS_THRUST = 8
 """Bit 3 of GUID_OPTIONS; without it, thrust in SET_ATTITUDE_TARGET is a climb rate."""
+_NO_VELOCITY = 32
+"""Bit 5 of GUID_OPTIONS, "Do not stabilize VelocityXY"."""
 _CONTINUE_LANDING = 8
 """Bit 3 of FS_OPTIONS."""
 
@@ -255,14 +257,19 @@ def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterat
 
 def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what misreads, keeps or weakens setpoints in GUIDED."""
-    if context.output != "velocity":
-        if (options := values.get("GUID_OPTIONS")) is None:
-            said = "it has not sent GUID_OPTIONS, which is asked for again"
-            yield ParamNote("obstacle", ("GUID_OPTIONS",), said)
-        elif not int(options) & _THRUST_AS_THRUST:
-            effect = ", with which it takes our thrust for a climb rate"
-            mended = int(options) | _THRUST_AS_THRUST
+    options = values.get("GUID_OPTIONS")
+    if context.output == "velocity":
+        if options is not None and int(options) & _NO_VELOCITY:
+            effect = ", with which it ignores our velocity to the north and east"
+            mended = int(options) & ~_NO_VELOCITY
             yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
+    elif options is None:
+        said = "it has not sent GUID_OPTIONS, which is asked for again"
+        yield ParamNote("obstacle", ("GUID_OPTIONS",), said)
+    elif not int(options) & _THRUST_AS_THRUST:
+        effect = ", with which it takes our thrust for a climb rate"
+        mended = int(options) | _THRUST_AS_THRUST
+        yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
     yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
     if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
         yield ParamNote(

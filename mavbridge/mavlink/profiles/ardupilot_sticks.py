@@ -29,8 +29,8 @@ from mavbridge.mavlink.profiles.sticks import (
 
 STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
 """RCMAP_* suffixes in the order of ``Sticks``."""
-OPTION_CHANNELS = range(5, 17)
-"""Channels of a radio's switches; by default the first four carry the sticks."""
+OPTION_CHANNELS = range(1, 17)
+"""Channels of a radio, which may all carry a switch where no stick is."""
 SIMPLE_NAMES = ("SIMPLE", "SUPER_SIMPLE")
 _SIMPLE_OPTIONS = (3.0, 13.0)
 """RCn_OPTION "Simple Mode" and "Super Simple Mode"."""
@@ -144,16 +144,17 @@ def stick_names(values: Mapping[str, float], *parts: str) -> tuple[str, ...]:
 
 def calibration(values: Mapping[str, float]) -> RcCalibration:
     """Return the radio calibration. Raise ValueError if parameters are missing or contradictory."""
-    throttle, yaw, pitch, roll = (
-        _channel(values, int(_require(values, f"RCMAP_{stick}"))) for stick in STICKS
-    )
+    throttle, yaw, pitch, roll = (_channel(values, f"RCMAP_{stick}") for stick in STICKS)
     floor_us = int(values.get("FS_THR_VALUE", 0)) + FS_THR_MARGIN_US
     return RcCalibration(
         throttle=throttle, yaw=yaw, pitch=pitch, roll=roll, throttle_floor_us=floor_us
     )
 
 
-def _channel(values: Mapping[str, float], number: int) -> RcChannel:
+def _channel(values: Mapping[str, float], stick: str) -> RcChannel:
+    number = int(_require(values, stick))
+    if number not in range(1, 9):
+        raise ValueError(f"{stick} is {number}, and sticks go to channels 1 to 8: --set {stick}=N")
     return RcChannel(
         number=number,
         min_us=int(_require(values, f"RC{number}_MIN")),
@@ -180,7 +181,8 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
     """
     for name, turned_by in zip(SIMPLE_NAMES, ("heading at arming", "way home"), strict=True):
         if bits := values.get(name, 0):
-            yield ParamNote.of("obstacle", name, bits, f": {TURNED}the {turned_by}", 0)
+            note = ParamNote.of("obstacle", name, bits, f": {TURNED}the {turned_by}", 0)
+            yield note._replace(turns_sticks=True)
     sticks = {values[name]: name for name in map("RCMAP_{}".format, STICKS) if name in values}
     for number in sorted({*OPTION_CHANNELS, *map(int, sticks)}):
         option = values.get(name := f"RC{number}_OPTION", 0)
@@ -189,7 +191,18 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
             yield ParamNote.of("obstacle", name, option, effect, 0)
         elif option in _SIMPLE_OPTIONS:
             effect = f": with that switch, {TURNED}the heading at arming or of the way home"
-            yield ParamNote.of("obstacle", name, option, effect, 0)
+            yield ParamNote.of("obstacle", name, option, effect, 0)._replace(turns_sticks=True)
+    for number, stick in sticks.items():
+        low, trim, high, dead = (
+            values.get(f"RC{number:g}_{part}", 0.0) for part in ("MIN", "TRIM", "MAX", "DZ")
+        )
+        if stick != "RCMAP_THROTTLE" and low < trim < high and dead >= min(trim - low, high - trim):
+            yield ParamNote(
+                "obstacle",
+                (f"RC{number:g}_DZ", f"RC{number:g}_TRIM"),
+                f"RC{number:g} goes from {low:g} to {high:g} us around {trim:g}, and its dead zone "
+                f"of {dead:g} us hides one half of the stick of {stick}: calibrate the radio",
+            )
     if (channel := values.get("FLTMODE_CH")) in sticks:
         effect = f": the stick of {sticks[channel]} would change the flight mode"
         free = next((number for number in range(5, 9) if number not in sticks), 0)

@@ -111,6 +111,8 @@ class ParamNote(NamedTuple):
     """Name by which the user accepts a note of kind risk."""
     refusal: Reason | None = None
     """Reason for which a risk that is not accepted forbids a flight."""
+    turns_sticks: bool = False
+    """True if it changes what the sticks of a pilot mean, too."""
 
     @classmethod
     def of(

@@ -35,6 +35,8 @@ def after_reading(vehicle: ParamVehicle) -> ParamVehicle:
         ({"RC1_MIN": None}, "not sent parameter RC1_MIN"),
         ({"RCMAP_ROLL": None}, "not sent parameter RCMAP_ROLL"),
         ({"RCMAP_YAW": 3.0}, "two sticks on one channel"),
+        ({"RCMAP_YAW": 0.0}, "RCMAP_YAW is 0, and sticks go to channels 1 to 8: --set RCMAP_YAW=N"),
+        ({"RCMAP_ROLL": 9.0}, "RCMAP_ROLL is 9"),
         ({"RC2_MIN": 700.0}, "--set RC2_MIN=800"),
     ],
 )
@@ -85,6 +87,13 @@ def test_a_risk_is_refused_until_it_is_accepted_or_mended(
         later.set_by_pilot(name, value)
     assert (later.params.interruption, later.problem()) == (None, None)
     assert any(text.startswith(f"risk {risk} is accepted") for text in accepted.texts)
+
+
+@pytest.mark.parametrize("change", [{"SIMPLE": 63.0}, {"RC7_OPTION": 13.0}])
+def test_a_recording_is_told_what_turns_the_pilots_sticks(change: dict[str, float]) -> None:
+    vehicle = after_reading(ParamVehicle(change | {"RC_OPTIONS": 2.0}, pilot_hz=100.0))
+    (text,) = vehicle.texts
+    assert text.startswith(f"{next(iter(change))} is ")
 
 
 def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:

@@ -201,13 +201,13 @@ class VehicleParams:
 
     def _advise(self, status: VehicleStatus | None) -> None:
         assessment = self._current(status)
-        context = assessment.context
-        has_output = context.output is not None and self._config.pilot_hz is None
+        context, is_piloted = assessment.context, self._config.pilot_hz is not None
+        has_output = context.output is not None
         if not has_output or context == self._advised or not self.changes.is_settled:
             return
         self._advised = context
         for note in assessment.notes:
-            if note.kind == "advice":
+            if note.turns_sticks if is_piloted else note.kind == "advice":
                 self._report(AdviceText(note.text))
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:

@@ -136,7 +136,8 @@ def test_advice(
         ({"GUID_OPTIONS": 0.0}, "attitude", "GUID_OPTIONS is 0.*climb rate.*--set GUID_OPTIONS=8"),
         ({"GUID_OPTIONS": 1.0}, "rates", "--set GUID_OPTIONS=9"),
         ({"GUID_OPTIONS": 9.0}, "rates", None),
-        ({"GUID_OPTIONS": 0.0}, "velocity", None),
+        ({"GUID_OPTIONS": 16.0}, "velocity", None),
+        ({"GUID_OPTIONS": 40.0}, "velocity", "GUID_OPTIONS is 40.*our vel.*--set GUID_OPTIONS=8"),
         ({"Q_ENABLE": 1.0}, "velocity", "an ArduPlane"),
         ({"Q_ENABLE": 0.0}, "rc-override", "an ArduPlane"),
         ({"MAV_GCS_SYSID": 255.0}, "rc-override", None),
@@ -167,6 +168,7 @@ RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YA
         ("SUPER_SIMPLE", 8.0),
         ("RC7_OPTION", 3.0),
         ("RC12_OPTION", 13.0),
+        ("RC4_OPTION", 3.0),  # no stick is on this channel
         ("RC3_OPTION", 153.0),  # the throttle arms
         ("RC6_OPTION", 4.0),  # the yaw stick returns home
         ("FLTMODE_CH", 6.0),
@@ -178,6 +180,26 @@ def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: floa
     assert (note.names, flag) == ((name,), f"--set {name}")
     assert notes_of(ARDUPILOT, RCMAP | {name: float(mended)}, "rc-override") == []
     assert notes_of(ARDUPILOT, RCMAP | {name: value}, "velocity") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "is_refused"),
+    [
+        ({}, False),
+        ({"RC1_TRIM": 1981.0}, True),
+        ({"RC1_MIN": 1490.0}, True),
+        ({"RC2_DZ": 600.0}, True),
+        ({"RC3_DZ": 600.0}, False),  # the throttle counts from the bottom
+    ],
+)
+def test_a_half_of_a_stick_inside_its_dead_zone_is_refused(
+    change: dict[str, float], is_refused: bool
+) -> None:
+    usual = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "DZ": 20.0}
+    radio = {f"RC{n}_{part}": value for n in (1, 2, 3, 6) for part, value in usual.items()}
+    notes = notes_of(ARDUPILOT, RCMAP | radio | change, "rc-override")
+    assert [note.kind for note in notes] == ["obstacle"] * is_refused
+    assert all("hides one half of the stick of RCMAP_" in note.text for note in notes)
 
 
 @pytest.mark.parametrize(
