@@ -166,7 +166,9 @@ class Relay(Worker):
         self.has_heard = threading.Event()
         """Set once the vehicle has sent something, so that its address is known."""
         self.longest_silence_ms = 0.0
-        """Longest time in flight without a packet of the vehicle, before any fault of the link."""
+        """Longest time in flight without a packet of the vehicle, before any fault of the link and
+        before a reboot."""
+        self.has_rebooted = False
         self._heard_ns = 0
         self.port: int = self._socket.getsockname()[1]
 
@@ -287,7 +289,7 @@ class Relay(Worker):
             data, self._vehicle = self._socket.recvfrom(65536)
         except (BlockingIOError, ConnectionError):
             return
-        if self.has_flown.is_set():
+        if self.has_flown.is_set() and not self.has_rebooted:
             silence_ms = (now_ns - self._heard_ns) / NS_PER_MS
             self.longest_silence_ms = max(self.longest_silence_ms, silence_ms)
         self._heard_ns = now_ns

@@ -155,7 +155,7 @@ def pilot(stage: Stage, *, act: str, mode: str = "") -> int:
     if act == "mode":
         return relay.set_mode(mode)
     if act == "reboot":
-        number = dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+        number, relay.has_rebooted = dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, True
         return relay.command(number, 1, 0, 0, 0, 0, REBOOT_IN_FLIGHT)
     return {"arm": relay.arm, "disarm": relay.disarm}[act]()
 
