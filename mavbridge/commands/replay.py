@@ -49,6 +49,7 @@ from mavbridge.simulation.replay.compare import (
 from mavbridge.simulation.replay.guard import recorded_plan, replay_guard, replay_other
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
+from policy.errors import NoChunkError
 from policy.protocol import PolicyRunner
 
 VIDEO_TOLERANCE = 0.15
@@ -242,11 +243,15 @@ def _encoded(
         each.frame_id: each.fault for each in (source.features[number] if source.features else ())
     }
     for row, rgb in zip(flight.frame_rows(), flight.images(), strict=True):
+        try:
+            value = runner.encode(rgb, number).copy()
+        except NoChunkError:
+            continue  # as in flight, where the image has no feature
         yield FeatureFrame(
             frame_id=row.frame_id,
             captured_ns=row.captured_ns,
             ready_ns=row.ready_ns,
-            value=runner.encode(rgb, number).copy(),
+            value=value,
             fault=faults.get(row.frame_id),
         )
 

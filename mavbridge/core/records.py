@@ -218,7 +218,8 @@ class VisionTick:
     camera: int = 0
     """Index of the camera in the contract. All other fields belong to this camera."""
     feature: FloatArray | None = None
-    """Encoded image, read-only: feature [1, F] (dual rate) or the network's image (single rate)."""
+    """Encoded image, read-only: feature [1, F] (dual rate) or the network's image (single rate).
+    None: the policy refused the image, or features are not kept."""
     fault: Reason | None = None
     """Why the image must not be acted on, such as a frozen image."""
 

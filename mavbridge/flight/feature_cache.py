@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import FeatureFrame
 
 MAX_PAST = 1024
@@ -20,6 +21,8 @@ class FeatureCache:
         """Create an empty cache. ``span_ns``: how far before the newest exposure features are kept;
         0: none."""
         self._frame: FeatureFrame | None = None
+        self.refusal: Reason | None = None
+        """Why the policy refused the images since the newest feature; None: it did not."""
         self._span_ns = span_ns
         self._lock = threading.Lock()
         self._past: deque[FeatureFrame] = deque(maxlen=MAX_PAST)
@@ -27,7 +30,7 @@ class FeatureCache:
 
     def publish(self, frame: FeatureFrame) -> None:
         """Publish a new feature."""
-        self._frame = frame
+        self._frame, self.refusal = frame, None
         if not self._span_ns or frame.fault is not None:
             return
         with self._lock:

@@ -242,12 +242,12 @@ class ObservationSource:
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
             if feature is None:
-                return self._missing(camera, because(Code.NO_IMAGE))
+                return self._missing(camera, cache.refusal or because(Code.NO_IMAGE))
             if now_ns - feature.captured_ns > self._max_age_ns:
                 age_ms = (now_ns - feature.captured_ns) / NS_PER_MS
                 limit_ms = self._max_age_ns / NS_PER_MS
                 old = because(Code.TOO_OLD, quantity="image", age_ms=age_ms, limit_ms=limit_ms)
-                return self._missing(camera, old)
+                return self._missing(camera, cache.refusal or old)
             if feature.fault is not None:
                 return self._missing(camera, feature.fault)
             newest.append(feature)

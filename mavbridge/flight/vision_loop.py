@@ -43,8 +43,8 @@ class VisionLoop:
         Args:
             camera: read by this loop alone.
             encode: image of a camera to its feature.
-            cache: gets every feature; one whose image is at fault says so.
-            sink: gets a tick for every feature.
+            cache: gets every feature, with the fault of its image, and every refusal of the policy.
+            sink: gets a tick for every encoded or refused image.
             clock: time of the start and end of the encoding.
             period_ns: shortest time between two encoded frames.
             encoder_lock: held while encoding; loops that share a policy share it, because no
@@ -83,7 +83,8 @@ class VisionLoop:
     def step(self) -> None:
         """Wait up to ``READ_TIMEOUT_NS`` for one frame; encode and publish it.
 
-        An image for which the policy raises NoChunkError is skipped. Raise CameraError as ``run``.
+        An image for which the policy raises NoChunkError is shown and recorded, but has no feature.
+        Raise CameraError as ``run``.
         """
         frame = self._camera.read(READ_TIMEOUT_NS)
         started_ns = self._clock.now_ns()
@@ -100,24 +101,26 @@ class VisionLoop:
         if ahead_ns > MAX_AHEAD_NS:
             ahead_ms, limit_ms = ahead_ns / NS_PER_MS, MAX_AHEAD_NS / NS_PER_MS
             fault = because(Code.IMAGE_AHEAD, ahead_ms=ahead_ms, limit_ms=limit_ms)
+        value: FloatArray | None = None
         with self._encoder_lock:
             self.encoding_since_ns = self._clock.now_ns()
             try:
                 value = self._encode(frame.rgb, self._number)
-            except NoChunkError:
-                return  # the last feature ages, up to its limit
+            except NoChunkError as error:  # the last feature ages, up to its limit
+                self._cache.refusal = fault = because(Code.POLICY_REFUSED, said=str(error))
             finally:
                 self.encoding_since_ns = None
-        value.setflags(write=False)
         ready_ns = self._clock.now_ns()
-        feature = FeatureFrame(
-            frame_id=frame.frame_id,
-            captured_ns=captured_ns,
-            ready_ns=ready_ns,
-            value=value,
-            fault=fault,
-        )
-        self._cache.publish(feature)
+        if value is not None:
+            value.setflags(write=False)
+            feature = FeatureFrame(
+                frame_id=frame.frame_id,
+                captured_ns=captured_ns,
+                ready_ns=ready_ns,
+                value=value,
+                fault=fault,
+            )
+            self._cache.publish(feature)
         self._sink.emit(
             VisionTick(
                 serial=self._frames,

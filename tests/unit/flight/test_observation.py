@@ -154,6 +154,16 @@ def test_no_camera_may_be_missing_old_or_at_fault(
     assert (found if isinstance(found, Reason) else None) == reason
 
 
+@pytest.mark.parametrize("ago_ms", [None, 20, 301])
+def test_a_refusal_explains_an_image_that_is_missing_or_old(ago_ms: int | None) -> None:
+    cache, dark = FeatureCache(), because(Code.POLICY_REFUSED, said="too dark")
+    if ago_ms is not None:
+        cache.publish(seen(ago_ms))
+    cache.refusal = dark
+    found = source(Contract(feature_dim=1), cache).observe(felt(0), NOW_NS)
+    assert (found == dark) is (ago_ms != 20)
+
+
 def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:
     caches = FeatureCache(), FeatureCache()
     for cache, ago_ms in zip(caches, (20, 90), strict=True):

@@ -86,18 +86,22 @@ def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(is_watched):
     assert len(sink.visions) == 4 * NS_PER_S // FRAME_NS + 1
 
 
-def test_an_image_that_the_policy_skips_leaves_the_last_feature():
-    clock, cache = FakeClock(), FeatureCache()
+def test_an_image_that_the_policy_skips_leaves_the_last_feature_and_a_reason():
+    clock, cache, sink, seen = FakeClock(), FeatureCache(), ListSink(), []
 
     def encode(rgb, camera):
-        if clock.now_ns() > START_NS + 2 * FRAME_NS:
+        if clock.now_ns() == START_NS + 2 * FRAME_NS:
             raise NoChunkError("too dark")
         return np.zeros((1, 8), np.float32)
 
-    loop = make_loop(clock, StillCamera(clock, SCENE), cache=cache, encode=encode)
-    for _ in range(4):
+    loop = make_loop(clock, StillCamera(clock, SCENE), cache=cache, encode=encode, sink=sink)
+    for _ in range(3):
         loop.step()
-    assert (cache.latest().frame_id, loop.encoding_since_ns) == (2, None)
+        seen.append((cache.latest().frame_id, cache.refusal, loop.encoding_since_ns))
+    dark = because(Code.POLICY_REFUSED, said="too dark")
+    assert seen == [(1, None, None), (1, dark, None), (3, None, None)]
+    assert [vision.fault for vision in sink.visions] == [None, dark, None]
+    assert [vision.feature is None for vision in sink.visions] == [False, True, False]
 
 
 def test_a_camera_faster_than_the_visual_rate_is_thinned():
