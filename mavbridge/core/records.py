@@ -129,10 +129,11 @@ class Tick:
         """True if the link did not take the policy's action."""
         return self.trace is not None and self.sent is None and not self.readonly
 
-    def lacks_neutral(self, *, is_stick_flight: bool) -> bool:
-        """True if the link did not take neutral sticks, which are due in each pass of the way out;
-        neutral setpoints end on PX4 before the phase does."""
-        return is_stick_flight and self.sent is None and self.phase in ("leaving", "holding")
+    @property
+    def lacks_neutral(self) -> bool:
+        """True on the way out if nothing was sent: a refusal by the link if neutral was due, see
+        ``FlightMeta.keeps_neutral``."""
+        return self.sent is None and self.phase in ("leaving", "holding")
 
     @property
     def activity(self) -> str:

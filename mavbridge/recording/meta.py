@@ -91,6 +91,13 @@ class FlightMeta:
             return "cut off: shown up to its last whole batch of rows"
         return "images lost: the process that writes the video died; all else is whole"
 
+    @property
+    def keeps_neutral(self) -> bool:
+        """True if neutral is due in each pass of the way out; setpoints to PX4 end before it
+        does."""
+        is_stick_flight = self.contract is None or self.contract.action == "sticks"
+        return is_stick_flight or (self.autopilot or "").startswith("ardupilot")
+
     def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
         """Add the outcome; derive ``success`` from it if it is not set yet."""
         success = outcome.success if self.success is None else self.success

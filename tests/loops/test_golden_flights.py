@@ -54,11 +54,18 @@ def numpy_runner() -> Iterator[PolicyRunner]:
         yield loaded.runner
 
 
-@pytest.mark.parametrize(("phase", "is_flown"), [("flying", True), ("leaving", False)])
+@pytest.mark.parametrize(
+    ("name", "phase", "is_flown"),
+    [
+        ("numpy_px4", "flying", True),
+        ("numpy_px4", "leaving", False),
+        ("scripted_velocity_ardupilot", "leaving", False),
+    ],
+)
 def test_an_action_that_was_refused_in_flight_is_refused_in_the_replay(
-    phase: str, *, is_flown: bool
+    name: str, phase: str, *, is_flown: bool
 ) -> None:
-    source = golden("numpy_px4")
+    source = golden(name)
     at = [k for k, tick in enumerate(source.ticks) if tick.phase == phase and tick.sent][2]
     refused = replace(source.ticks[at], sent=None)
     ticks = (*source.ticks[:at], refused, *source.ticks[at + 1 :])

@@ -31,7 +31,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Solve, Tick
-from mavbridge.core.vehicle import Percentiles, Sticks
+from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
@@ -65,23 +65,27 @@ class HolderSpan:
     """Why the policy did not fly, for most of the span; None while it flew."""
 
 
-def _holder(tick: Tick, *, is_stick_flight: bool) -> Holder:
+def _holder(tick: Tick, *, keeps_neutral: bool) -> Holder:
     if tick.trace is not None:
         return "read-only" if tick.readonly else "policy"
-    if tick.sent is not None or tick.lacks_neutral(is_stick_flight=is_stick_flight):
+    if tick.sent is not None or (keeps_neutral and tick.lacks_neutral):
         return "idle" if tick.phase == "preparing" else "neutral"
     return "release" if tick.phase == "releasing" else "pilot"
 
 
-def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]:
+def holder_spans(
+    ticks: Sequence[Tick], start_ns: int, *, keeps_neutral: bool
+) -> tuple[HolderSpan, ...]:
     """Return the stretches in the order of time, each with its longest-lasting reason. A new reason
-    does not start a new stretch."""
+    does not start a new stretch.
+
+    ``keeps_neutral`` is that of ``FlightMeta``.
+    """
     spans: list[HolderSpan] = []
     ends_ns = [tick.woke_ns for tick in ticks[1:]] + [tick.woke_ns for tick in ticks[-1:]]
-    is_stick_flight = any(isinstance(tick.sent, Sticks) for tick in ticks)
     for holder, group in groupby(
         zip(ticks, ends_ns, strict=True),
-        lambda pair: _holder(pair[0], is_stick_flight=is_stick_flight),
+        lambda pair: _holder(pair[0], keeps_neutral=keeps_neutral),
     ):
         span = list(group)
         lasted_ns: Counter[object] = Counter()
@@ -196,7 +200,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         cameras=tuple(_cameras(flight, frames, series.start_ns, damage)),
         track=read_track(series, frames),
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
-        holders=holder_spans(ticks, series.start_ns),
+        holders=holder_spans(ticks, series.start_ns, keeps_neutral=flight.meta.keeps_neutral),
         delays=delays,
         moments=worst_moments(flight, ticks, frames, delays, limits),
         limits=limits,

@@ -73,15 +73,14 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     loop = GuardLoop(clock, link, port)
     settings = recorded_plan(source).guard
     port.inbox.append(encode_to_guard(settings))
-    is_stick_flight = settings.meaning.kind == "sticks"
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
     for tick, chunk, act, stop in _arrivals(source):
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
-        lacks_neutral = tick.lacks_neutral(is_stick_flight=is_stick_flight)
-        transport.is_refusing = tick.is_refused or lacks_neutral
+        is_neutral_refused = source.meta.keeps_neutral and tick.lacks_neutral
+        transport.is_refusing = tick.is_refused or is_neutral_refused
         messages: tuple[Chunk | OperatorCommand | EndRequest | None, ...] = (chunk, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()

@@ -115,23 +115,27 @@ def test_who_held_the_sticks_when() -> None:
         make_released_tick(6, old, phase="released"),
         make_released_tick(7, because(Code.DISARMED), phase="released"),
     ]
-    spans = holder_spans(ticks, START_NS)
+    spans = holder_spans(ticks, START_NS, keeps_neutral=True)
     names = ["pilot", "idle", "policy", "neutral", "release", "pilot"]
     assert [span.holder for span in spans] == names
     assert [span.start_s for span in spans] == pytest.approx([0.0, 0.01, 0.02, 0.04, 0.05, 0.06])
     assert [span.end_s for span in spans[:-1]] == [span.start_s for span in spans[1:]]
     assert [span.reason for span in spans[2:4]] == [None, old]
-    (looking_on,) = holder_spans([make_tick(0, sent=None, readonly=True)], START_NS)
+    (looking_on,) = holder_spans(
+        [make_tick(0, sent=None, readonly=True)], START_NS, keeps_neutral=True
+    )
     assert looking_on.holder == "read-only"
     setpoint = Velocity(1.0, 0.0, 0.0, 0.0)
     setpoints = [make_tick(0, sent=setpoint), make_released_tick(1, old, phase="leaving")]
-    assert [span.holder for span in holder_spans(setpoints, START_NS)] == ["policy", "pilot"]
+    for keeps, holder in ((False, "pilot"), (True, "neutral")):
+        spans = holder_spans(setpoints, START_NS, keeps_neutral=keeps)
+        assert [span.holder for span in spans] == ["policy", holder]
 
 
 def test_of_several_reasons_the_one_that_lasted_is_told() -> None:
     rising = [because(Code.TAKING_OFF, height_m=2.0 + k) for k in range(5)]
     reasons = [because(Code.NO_HEARTBEAT), *rising, because(Code.NO_CHUNK)]
     ticks = [make_released_tick(k, reason, phase="preparing") for k, reason in enumerate(reasons)]
-    (span,) = holder_spans(ticks, START_NS)
+    (span,) = holder_spans(ticks, START_NS, keeps_neutral=True)
     assert (span.holder, span.reason) == ("pilot", rising[-1])
     assert span.end_s == pytest.approx(0.06)
