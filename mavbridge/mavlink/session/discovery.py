@@ -57,8 +57,9 @@ class VehicleDiscovery:
     def __init__(self, *, target_system: int) -> None:
         self._target_system = target_system
         self._heard_ns: dict[VehicleIdentity, int] = {}
-        self._replaced: set[VehicleIdentity] = set()
-        """Vehicles at whose address another type was heard since."""
+        """Last heartbeat of each vehicle, the oldest first."""
+        self._begun_ns: dict[VehicleIdentity, int] = {}
+        """First heartbeat of each vehicle."""
         self._others: set[str] = set()
         self._odd_components: set[int] = set()
         """Components other than 1 that claim to be an autopilot."""
@@ -88,20 +89,26 @@ class VehicleDiscovery:
             vehicle_type=heartbeat.vehicle_type,
             autopilot=heartbeat.autopilot,
         )
-        if vehicle not in self._heard_ns:
-            place = source, address
-            old = {other for other in self._heard_ns if (other.source, other.address) == place}
-            self._replaced = (self._replaced | old) & self._heard_ns.keys()
-        self._replaced.discard(vehicle)
+        self._begun_ns.setdefault(vehicle, now_ns)
         self._heard_ns.pop(vehicle, None)
         if len(self._heard_ns) >= _CAPACITY:
-            del self._heard_ns[next(iter(self._heard_ns))]  # heard longest ago
+            oldest = next(iter(self._heard_ns))
+            del self._heard_ns[oldest]
+            self._begun_ns.pop(oldest, None)
         self._heard_ns[vehicle] = now_ns
         if self._first_ns is None and self._is_wanted(vehicle):
             self._first_ns = now_ns
 
     def _is_wanted(self, vehicle: VehicleIdentity) -> bool:
         return self._target_system in (0, vehicle.source.system)
+
+    def _is_present(self, vehicle: VehicleIdentity) -> bool:
+        """False for a type heard once among others at its address, perhaps damaged, or replaced."""
+        place, heard_ns = (vehicle.source, vehicle.address), self._heard_ns[vehicle]
+        others = [each for each in self._begun_ns if (each.source, each.address) == place]
+        others.remove(vehicle)
+        is_replaced = any(heard_ns < self._begun_ns[e] < self._heard_ns[e] for e in others)
+        return not others or (self._begun_ns[vehicle] < heard_ns and not is_replaced)
 
     @property
     def is_settling(self) -> bool:
@@ -116,7 +123,7 @@ class VehicleDiscovery:
         """
         if self._first_ns is None or now_ns - self._first_ns < SETTLE_NS:
             return None
-        present = [vehicle for vehicle in self._heard_ns if vehicle not in self._replaced]
+        present = filter(self._is_present, self._begun_ns)
         wanted = [vehicle for vehicle in present if self._is_wanted(vehicle)]
         systems = sorted({vehicle.source.system for vehicle in wanted})
         if len(systems) > 1:

@@ -91,6 +91,8 @@ def test_a_vehicle_that_changes_its_type_is_one_vehicle() -> None:
     """ArduPilot is a quadrotor until its motors are set up."""
     discovery = VehicleDiscovery(target_system=0)
     discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 0)
+    discovery.receive(Endpoint(1, 1), heartbeat(dialect.MAV_TYPE_HEXAROTOR), ("host", 5), S // 2)
+    assert discovery.choose(2 * S) is None, "one of the two may be damaged"
     discovery.receive(Endpoint(1, 1), heartbeat(dialect.MAV_TYPE_HEXAROTOR), ("host", 5), S)
     vehicle = discovery.choose(2 * S)
     assert vehicle is not None
@@ -103,6 +105,16 @@ def test_a_vehicle_that_changes_its_type_is_one_vehicle() -> None:
     discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 5), 4 * S)  # both: two, by a router
     with pytest.raises(PeerError, match="two vehicles"):
         discovery.choose(4 * S)
+
+
+@pytest.mark.parametrize("types", ["242", "422", "224", "22422", "33322"])
+def test_one_damaged_heartbeat_gives_a_vehicle_no_other_type(types: str) -> None:
+    discovery = VehicleDiscovery(target_system=0)
+    for at_s, digit in enumerate(types):
+        discovery.receive(Endpoint(1, 1), heartbeat(int(digit)), ("host", 5), at_s * S)
+    vehicle = discovery.choose(len(types) * S)
+    assert vehicle is not None
+    assert vehicle.vehicle_type == 2
 
 
 def test_a_vehicle_is_followed_however_often_it_moves() -> None:
