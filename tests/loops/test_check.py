@@ -181,6 +181,15 @@ def test_without_a_receiver_its_failsafes_count() -> None:
     assert seen["radio receiver"].verdict == "go"
 
 
+def test_a_receiver_that_is_ignored_has_a_remedy_for_each_firmware() -> None:
+    bench = Bench(params=SAFE | {"FS_THR_ENABLE": 0})
+    bench.clock.sleep_until_ns(bench.clock.now_ns() + 3 * NS_PER_S)
+    assert bench.vehicle.params.set("RC_OPTIONS", 33)  # its channels keep the last values
+    row = bench.check(contract=Contract())["radio receiver"]
+    assert (row.found, row.verdict) == ("ignored by a parameter", "warn")
+    assert "RC_OPTIONS bit 0" in row.advice
+
+
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_policy_of_setpoints_has_parameters_of_its_own(autopilot: AutopilotName) -> None:
     rows = Bench(autopilot).check(contract=Contract(action="rates"), echo_test=True)

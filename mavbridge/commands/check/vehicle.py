@@ -362,8 +362,9 @@ def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[Che
 def _receiver_row(vehicle: VehicleSession, status: VehicleStatus) -> CheckRow:
     name, expected = "radio receiver", "a pilot who can take over"
     if vehicle.params.traits.ignores_receiver and vehicle.condition.has_receiver:
-        text = "neither its sticks nor its switches count: set COM_RC_IN_MODE to 6 (PX4 1.17)"
-        return _row(name, "ignored by COM_RC_IN_MODE", expected, text)
+        remedy = "clear RC_OPTIONS bit 0 (ArduPilot), or set COM_RC_IN_MODE to 6 (PX4 1.17)"
+        text = f"neither its sticks nor its switches count: {remedy}"
+        return _row(name, "ignored by a parameter", expected, text)
     if not status.has_receiver:
         return _row(
             name,
