@@ -35,8 +35,19 @@ def user_path(name: str | Path) -> Path:
 
 
 def library_name(path: Path) -> str:
-    """Return an absolute path: FFmpeg and Arrow mistake ``10:30.mp4`` for an address."""
-    return os.path.abspath(path)  # noqa: PTH100 - Path.absolute keeps ".."
+    """Return an absolute path: FFmpeg and Arrow mistake ``10:30.mp4`` for an address.
+
+    Raises:
+        PolicyError: it is not UTF-8; OpenCV crashes on such a path.
+    """
+    name = os.path.abspath(path)  # noqa: PTH100 - Path.absolute keeps ".."
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:
+        raise PolicyError(
+            f"{path}: its name, or that of a folder above it, is not UTF-8: rename it"
+        ) from error
+    return name
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -124,7 +135,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
     """Open a safetensors file; raise CheckpointError if it is damaged, also during later reads."""
     try:
-        with safe_open(path, framework=framework) as file:
+        with safe_open(library_name(path), framework=framework) as file:
             yield file
     except (TypeError, AttributeError) as error:  # NumPy has no bfloat16 and no float8
         raise CheckpointError(

@@ -128,12 +128,12 @@ class ExportConfig:
     vertical in body axes, the same on every heading, which other networks learn from sooner."""
 
     def __post_init__(self) -> None:
-        """Refuse an empty task, and a size that a video cannot have."""
+        """Refuse a task without words, and a size that a video cannot have."""
         size = self.image_size
         if size is not None and (size % 2 or not 16 <= size <= 4096):
             raise UserError(f"--image-size {size}: an even number from 16 to 4096")
-        if not self.task.strip():
-            raise UserError("--task is empty: describe what the flights do")
+        if not self.task.strip() or not self.task.isprintable():
+            raise UserError("--task must be words, in UTF-8: describe what the flights do")
 
 
 @Parameter(name="*")

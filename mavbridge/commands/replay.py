@@ -383,7 +383,8 @@ def draw(result: ReplayResult, path: Path) -> None:
             axes.set_title(f"{name}, largest difference {largest:.2g}", fontsize=10)
         rows[0].legend(loc="upper right", ncols=2)
         rows[-1].set_xlabel("s since the first tick")
-        title = f"{result.source.folder.name}: smoothed actions, replayed from {result.chosen}"
+        name = result.source.folder.name.encode(errors="replace").decode()
+        title = f"{name}: smoothed actions, replayed from {result.chosen}"
         figure.suptitle(title, x=0.012, ha="left", color=MUTED, fontsize=10)
         figure.tight_layout(rect=(0, 0, 1, 0.98))
         try:

@@ -64,7 +64,7 @@ def write_output(path: Path, text: str, flag: str) -> None:
             except OSError as error:
                 if error.errno not in _NOT_REPLACED:
                     raise
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise UserError(
             f"cannot write {flag} {path}: {error.strerror or error}; make room there, or name "
@@ -84,7 +84,7 @@ def write_durably(path: Path, text: str) -> None:
     temporary = path.with_suffix(f".{os.getpid()}")
     temporary.unlink(missing_ok=True)  # left by a loss of power, or a stranger's link
     try:
-        with temporary.open("x", encoding="utf-8") as file:
+        with temporary.open("x", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())

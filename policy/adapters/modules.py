@@ -23,7 +23,7 @@ from policy.adapters.description import USUAL_NAMES, Description
 from policy.adapters.interface import Interface
 from policy.engines.torch_engines import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
-from policy.files import why_unreadable
+from policy.files import library_name, why_unreadable
 from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
 from policy.protocol import SingleRatePolicy, predict_by_pair
 
@@ -80,7 +80,7 @@ def load_torchscript(
     try:
         # torch warns that this is deprecated; few projects export to its successor yet.
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
-            module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+            module = torch.jit.load(library_name(path), map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError) as error:
         raise CheckpointError(why_unreadable(path, error)) from error
     contract = replace(description.interface.contract, arrays="torch")

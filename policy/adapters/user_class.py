@@ -131,7 +131,7 @@ def _import_file(path: Path) -> ModuleType:
     folder = str(resolved.parent)
     if folder not in sys.path:
         sys.path.append(folder)  # last: nothing in it can shadow an installed module
-    name = f"_policy_file_{sha256(str(resolved).encode()).hexdigest()[:8]}_{resolved.stem}"
+    name = f"_policy_file_{sha256(os.fsencode(resolved)).hexdigest()[:8]}_{resolved.stem}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, resolved)

@@ -6,7 +6,7 @@ from helpers.camera_senders import FakeCapture
 from helpers.fakes import START_NS
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import CameraError
+from mavbridge.core.errors import CameraError, PolicyError
 
 FRAMES = 10
 PERIOD_NS = NS_PER_S // 20
@@ -54,6 +54,8 @@ def test_a_file_that_is_no_video_is_refused(tmp_path, clock):
     path.write_text("not a video")
     with pytest.raises(CameraError, match="no video that can be decoded"):
         VideoFileCamera(path, clock=clock)
+    with pytest.raises(PolicyError, match="is not UTF-8: rename it"):
+        VideoFileCamera(path.rename(tmp_path / "caf\udce9.mp4"), clock=clock)
 
 
 @pytest.mark.parametrize(

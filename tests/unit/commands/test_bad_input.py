@@ -61,6 +61,9 @@ BAD = [
     ("export spots --out new --image-size 97", "--image-size"),
     ("export spots --out new --image-size 5000", "--image-size"),
     ("export spots --out new --task ' '", "--task"),
+    ("export spots --out new --task caf\udce9", "--task"),
+    ("export spots --out caf\udce9", "is not UTF-8: rename it"),
+    (f"{IMAGINE} --start flight --world-model caf\udce9.safetensors", "is not UTF-8: rename it"),
     ("export-policy --out new --policy scripted", "toge and resnet-unet are exported"),
     ("export-policy --out new --policy resnet-unet", "needs trained weights"),
     ("export-policy --out taken.mp4", "is taken"),
@@ -156,7 +159,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "broken.onnx").write_bytes(b"not a graph")
     (folder / "foreigners/000000").mkdir(parents=True)
     (folder / "foreigners/000000/thesis.tex").write_text("years of work")
-    save_world_model(folder / "world.safetensors", TinyWorld())
+    for name in ("world", "caf\udce9"):
+        save_world_model(folder / f"{name}.safetensors", TinyWorld())
     save_world_model(folder / "enu.safetensors", TinyWorld(replace(TINY, contract=ENU)))
     save_broken_world_model(folder / "broken.safetensors")
     (folder / "taken.mp4").write_text("precious")

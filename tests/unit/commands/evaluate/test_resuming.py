@@ -92,8 +92,9 @@ def test_a_full_disk_ends_the_evaluation_and_keeps_its_results(
 
 def test_a_link_planted_for_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / f"out.{os.getpid()}").symlink_to(tmp_path / "victim")
-    write_output(tmp_path / "out.json", "text", "--json")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": "text"}
+    write_output(tmp_path / "out.json", "caf\udce9", "--json")
+    text = r"caf\udce9"
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": text}
 
 
 @pytest.mark.parametrize("number", [errno.EBUSY, errno.EROFS])
@@ -106,8 +107,9 @@ def test_a_file_that_cannot_be_replaced_is_written_in_place(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "replace", fail)
-    write_output(tmp_path / "out.json", "text", "--json")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": "text"}
+    write_output(tmp_path / "out.json", "caf\udce9", "--json")
+    text = r"caf\udce9"
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": text}
 
 
 def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
