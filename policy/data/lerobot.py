@@ -198,6 +198,13 @@ def _read_episodes(info: _Info) -> list[_Row]:
         raise DatasetError(
             f"{info.folder}: {table.num_rows} episodes in it; must be 1 to {_MAX_EPISODES}"
         )
+    episodes = number_column(f"{info.folder}, meta/episodes", table, "episode_index")
+    found, counts = np.unique(episodes, return_counts=True)
+    if counts.max() > 1:  # it could be both trained on and held out
+        raise DatasetError(
+            f"{info.folder}: meta/episodes lists episode {found[counts.argmax()]} {counts.max()} "
+            "times: keep one row of it"
+        )
     return [_row(info, values) for values in table.to_pylist()]
 
 

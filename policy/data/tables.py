@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -41,11 +42,13 @@ def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
     """Return a column of lists of ``width`` finite numbers, [rows, width] float32, null as NaN."""
     values = table[column].combine_chunks()
     valid = values.is_valid().to_numpy(zero_copy_only=False).astype(bool)
+    lists = values.drop_null()
     try:
-        flat = values.drop_null().flatten().to_numpy(zero_copy_only=False).astype(np.float32)
-    except (AttributeError, TypeError, ValueError):
+        widths = pc.unique(pc.list_value_length(lists)).to_pylist()
+        flat = lists.flatten().to_numpy(zero_copy_only=False).astype(np.float32)
+    except (pa.ArrowException, AttributeError, TypeError, ValueError):
         flat = None
-    if flat is None or flat.size != valid.sum() * width:
+    if flat is None or widths not in ([], [width]):
         raise DatasetError(f"{name}: {column} must hold {width} numbers a row")
     rows = flat.reshape(-1, width)
     if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:

@@ -154,6 +154,12 @@ def _scalar_state(table: pa.Table) -> pa.Table:
     return table.set_column(0, "observation.state", pa.array(np.zeros(table.num_rows, "f4")))
 
 
+def _ragged(table: pa.Table) -> pa.Table:
+    first, second, *rest = table["action"].to_pylist()
+    values = pa.array([first[:3], [*second, 0.0], *rest], pa.list_(pa.float32()))
+    return table.set_column(table.column_names.index("action"), "action", values)
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -167,10 +173,12 @@ def _scalar_state(table: pa.Table) -> pa.Table:
         (_state(names=list(STATE_NAMES[::-1])), "in this order"),
         (_state(info={"state_frame": "body"}), "state frame is 'body'"),
         (_rows("observation.state", _nan), "NaN or infinity in row 3"),
+        (_table(_ragged), "action must hold 4 numbers a row"),
         (_rows("timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
         (_rows("timestamp", lambda v: [3 * t for t in v]), "row 11 is 0.88 s off: .* 1 / 25 s"),
         (_rows("timestamp", lambda v: [0.0] * len(v)), "row 11 is 0.44 s off"),
         (_rows("length", lambda v: [12, 0], EPISODES), "has 0 rows"),
+        (_rows("episode_index", lambda v: [1, 1], EPISODES), "lists episode 1 2 times"),
         (_rows(BEGIN, lambda v: [0.0, np.nan], EPISODES), "from_timestamp nan"),
         (_table(lambda t: t.take([0] * 100_001), EPISODES), "has 100001 rows, more than 100000"),
         (_other_types, "meta/episodes differ in columns"),
