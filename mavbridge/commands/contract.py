@@ -18,7 +18,7 @@ from policy.adapters.drafts import (
 from policy.adapters.interface import UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE
 from policy.data.lerobot import is_lerobot
-from policy.files import CONTRACT_FILE
+from policy.files import CONTRACT_FILE, read_text, read_toml
 
 
 def contract(source: Path, config: ContractConfig) -> int:
@@ -50,12 +50,13 @@ def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
             "dataset (a folder with meta/info.json), nor ONNX (a file, or a folder of them)"
         )
     dataset = dataset or dataset_of(source)
-    if dataset is not None and (known := dataset / CONTRACT_FILE).is_file():
+    if dataset is not None and (described := dataset / CONTRACT_FILE).is_file():
         try:
-            text = known.read_text(encoding="utf-8")
+            read_toml(described)  # which may hold open questions: no read_interface
+            text = read_text(described)
         except (OSError, ValueError) as error:
-            raise UserError(f"{known} cannot be read: {error}") from error
-        return text, f"a copy of {known}, which mavbridge export wrote"
+            raise UserError(f"{described} cannot be copied: {error}") from error
+        return text, f"a copy of {described}, which mavbridge export wrote"
     text, summary = _described(source, checkpoint_entries(source, dataset))
     if dataset is None:
         return text, f"{summary}\nmore is known with the dataset that it was trained on: --dataset"
