@@ -75,8 +75,11 @@ def stand_in(path: Path) -> tuple[str, str] | None:
 def stand_in_of(head: bytes) -> tuple[str, str] | None:
     """Return a foreign file's real content, known by its first bytes, and the remedy; else None.
 
-    Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
+    Recognises empty files, Git LFS pointers, text in UTF-16 or UTF-32, and web pages saved under a
+    file's name.
     """
+    if head.startswith(_WIDE_MARKS):
+        return "text in UTF-16 or UTF-32", "save it as UTF-8"
     start = head[:_HEAD_BYTES].lstrip().lower()
     if not start:
         return "empty, or cut short", "copy it again"
@@ -157,8 +160,11 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise ValueError(f"it is larger than {max_bytes // 1024} KiB")
-    if data.startswith(_WIDE_MARKS):
-        raise ValueError("it is UTF-16 or UTF-32: save it as UTF-8")
+    return decode_text(data)
+
+
+def decode_text(data: bytes) -> str:
+    """Decode UTF-8 text, with or without a byte order mark; raise ValueError as ``read_text``."""
     if data.strip() and (found := stand_in_of(data)) is not None:
         raise ValueError(f"it is {found[0]}: {found[1]}")
     try:

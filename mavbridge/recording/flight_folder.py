@@ -15,6 +15,7 @@ from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import count_lost, read_numbered, read_table, table_exists
 from mavbridge.recording.video.file import read_video
 from policy.data.flight_video import with_images
+from policy.files import why_unreadable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +104,8 @@ def _frames(
     except OSError as error:
         raise FlightError(f"{folder / video} cannot be read: {error.strerror}") from error
     if meta.finished and len(numbers) and not len(places):
-        raise FlightError(f"{folder / video} holds none of {len(numbers)} images: copy it again")
+        none = ValueError(f"it holds none of {len(numbers)} images")
+        raise FlightError(why_unreadable(folder / video, none))
     damage += more
     numbers = numbers[places]
     return count_lost(table.take(places), numbers), tuple(numbers.tolist())

@@ -20,7 +20,7 @@ from policy.adapters.description import Description
 from policy.adapters.interface import Interface
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError, user_code, user_line
-from policy.files import user_path
+from policy.files import stand_in, user_path
 from policy.protocol import DualRatePolicy, SingleRatePolicy, predict_by_pair
 
 FORMS = (
@@ -72,7 +72,8 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
     except ContractError as error:
         raise PolicyError(f"--policy {spec}: {error}{user_line(error)}") from error
     except PolicyError as error:
-        raise PolicyError(f"--policy {spec}: {error}; {_import_hint(error.__cause__)}") from error
+        hint = _import_hint(where, error.__cause__)
+        raise PolicyError(f"--policy {spec}: {error}; {hint}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         classes = sorted(
@@ -146,8 +147,11 @@ def _import_file(path: Path) -> ModuleType:
     return module
 
 
-def _import_hint(error: BaseException | None) -> str:
-    """Return the remedy for a failed import."""
+def _import_hint(where: Path | str, error: BaseException | None) -> str:
+    """Return the remedy for a failed import of ``where`` or one of its neighbours."""
+    source = Path(error.filename or where if isinstance(error, SyntaxError) else where)
+    if (found := stand_in(source)) is not None:
+        return f"{source} is {found[0]}: {found[1]}"
     name = error.name if isinstance(error, ImportError) and error.name else ""
     package = name.partition(".")[0]
     if package in OUR_PACKAGES:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from policy.contract import FloatArray
 from policy.data.flight_data import DatasetError, Nanoseconds
+from policy.files import why_unreadable
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
@@ -85,7 +86,7 @@ def read_rows(
             f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
         ) from error
     except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"{path} is damaged: {error}") from error
+        raise DatasetError(why_unreadable(path, error)) from error
 
 
 def _read_batches(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:

@@ -105,6 +105,8 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
     ("code", "message"),
     [
         ("def (:", r"SyntaxError.*broken\.py"),
+        ("version https://git-lfs.github.com/spec/v1", r"broken\.py is a pointer of Git LFS"),
+        ("\udcff\udcfed\0", r"broken\.py is text in UTF-16"),
         ("raise ValueError('no camera here')", r"ValueError: no camera here \(.*broken\.py:1\)"),
         ("raise SystemExit('no')", r"SystemExit: no \(.*broken\.py:1\)"),
         ("import asyncio; raise asyncio.CancelledError('no')", r"CancelledError: no \("),
@@ -118,7 +120,7 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
     ],
 )
 def test_a_file_that_cannot_be_imported_says_why(folder: Path, code: str, message: str) -> None:
-    (folder / "broken.py").write_text(code + "\n")
+    (folder / "broken.py").write_text(code + "\n", errors="surrogateescape")
     for _ in range(2):  # nothing half imported is left behind
         with pytest.raises(PolicyError, match=message):
             load("./broken.py:Flying")

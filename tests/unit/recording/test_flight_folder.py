@@ -117,6 +117,10 @@ def _damage(name: str) -> Spoil:
     return lambda flight: (flight / name).write_bytes(b"something else altogether")
 
 
+def _pointer(name: str) -> Spoil:
+    return lambda flight: (flight / name).write_text("version https://git-lfs.github.com/spec/v1\n")
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
@@ -125,10 +129,12 @@ def _damage(name: str) -> Spoil:
         (_without("frames.parquet"), "lacks frames.parquet, though 10 frames were recorded"),
         (_without("camera.mp4"), "lacks camera.mp4, though 10 frames were recorded"),
         (_damage("meta.json"), "is not JSON"),
-        (_damage("ticks.parquet"), "ticks.parquet is damaged"),
+        (_damage("ticks.parquet"), "ticks.parquet cannot be read"),
+        (_pointer("ticks.parquet"), "fetch it with `git lfs pull`"),
+        (_pointer("camera.mp4"), "fetch it with `git lfs pull`"),
         (
             lambda flight: (flight / "ticks.parquet").rename(flight / "ticks.arrows"),
-            "ticks.arrows is damaged",
+            "ticks.arrows cannot be read",
         ),
         (_damage("camera.mp4"), "holds none of 10 images"),
         (_meta(format="other"), "is not of a recorded flight"),
