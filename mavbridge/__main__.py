@@ -31,11 +31,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from rich.markup import escape
 
         from mavbridge.cli import cli
+        from mavbridge.config.settings_files import with_home
         from mavbridge.observe.output import SafeConsole, survive_lost_readers
 
         if arguments is None:
             survive_lost_readers()
-        status = cli.meta(arguments)
+        status = cli.meta(with_home(list(sys.argv[1:] if arguments is None else arguments)))
     except KeyboardInterrupt:
         end(128 + signal.SIGINT)
     except MavbridgeError as error:

@@ -30,7 +30,6 @@ from mavbridge.config.settings_files import (
     Settings,
     print_settings,
     untrusted_settings,
-    with_home,
     with_settings,
 )
 from mavbridge.core.errors import UserError
@@ -40,7 +39,7 @@ from mavbridge.core.provenance import printable
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.adapters.websocket.kind import require_packages as require_websocket
-from policy.files import read_toml, user_path
+from policy.files import read_toml
 from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy. How to start:
@@ -348,7 +347,7 @@ def with_config(
     cli.config = []
     if config is not None:
         try:
-            document = read_toml(user_path(config))
+            document = read_toml(config)
         except OSError as error:
             raise UserError(f"--config {config}: {error.strerror}") from error
         except ValueError as error:
@@ -365,7 +364,7 @@ def with_config(
             )
         cli.config = [Settings(document, source=str(config))]
     with run_log(log_file, verbose=verbose):
-        status: int | None = cli(with_home(words))
+        status: int | None = cli(words)
     return status or 0
 
 

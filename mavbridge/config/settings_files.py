@@ -76,8 +76,8 @@ def _foreign(key: str, value: str) -> str | None:
     return None
 
 
-_HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
-"""A path below a home directory, behind a flag's name or a prefix such as ``lerobot:``."""
+_HOME = re.compile(r"((?:[\w.-]+=)*(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
+"""A path below a home directory, behind a flag's or camera's name, or a prefix (``lerobot:``)."""
 
 
 def with_settings(tokens: Sequence[str], texts: Sequence[str]) -> list[str]:

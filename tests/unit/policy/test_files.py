@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.__main__ import main
+from mavbridge.config.settings_files import with_home
 from policy.adapters.interface import read_interface
 from policy.errors import ContractError
 from policy.files import MAX_TOML_BYTES, open_regular, parse_json, read_toml
@@ -56,12 +57,20 @@ def test_text_of_windows_editors_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [["--policy", "lerobot:~/act"], ["--policy=lerobot:~/act"], ["--config", "~/fly.toml"]]
+    "words",
+    [
+        ["--policy", "lerobot:~/act"],
+        ["--policy=lerobot:~/act", "--log-file=~/run.log"],
+        ["--config", "~/fly.toml"],
+    ],
 )
 def test_the_command_line_expands_what_shells_leave(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
+    assert with_home(["front=~/v.mp4"]) == [f"front={tmp_path}/v.mp4"]
     (tmp_path / "fly.toml").write_text('policy = "lerobot:~/act"')
     with pytest.raises(SystemExit) as ended:
         main([*words, "--connect", "udp:127.0.0.1:1", "--camera", "none"])
     assert ended.value.code == 2
     assert f"{tmp_path}/act" in capsys.readouterr().err.replace("\n", "")
+    assert not Path("~").exists()
