@@ -309,7 +309,7 @@ def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig
 def _signing_key(path: Path) -> SigningKey:
     try:
         data = path.read_bytes()
-        key = data if len(data) == KEY_BYTES else bytes.fromhex(data.decode().strip())
+        key = data if len(data) == KEY_BYTES else bytes.fromhex(data.decode("utf-8-sig").strip())
     except (OSError, ValueError) as error:
         raise UsageError(f"--signing-key-file {path}: {error}") from error
     if len(key) != KEY_BYTES:

@@ -1,5 +1,6 @@
 """Files of MAVLink 2 signing: the key, and the state that must survive a restart."""
 
+import codecs
 import hashlib
 import json
 import os
@@ -20,6 +21,7 @@ from mavbridge.mavlink.codec.signing import (
     SigningState,
     Stream,
 )
+from policy.files import stand_in_of
 
 SAVE_S = 10.0
 AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS
@@ -54,6 +56,8 @@ def read_key(path: Path) -> bytes:
         )
     key = _key(data)
     if key is None:
+        if data.strip() and (found := stand_in_of(data)) is not None:
+            raise UserError(f"--signing-key-file {path} is {found[0]}: {found[1]}")
         raise UserError(
             f"--signing-key-file {path} holds {len(data)} bytes, but a key is 32 random bytes or "
             f"64 hexadecimal digits; {_MADE}, or from the passphrase of a ground station: "
@@ -68,7 +72,7 @@ def read_key(path: Path) -> bytes:
 
 
 def _key(data: bytes) -> bytes | None:
-    text = data.strip()
+    text = data.removeprefix(codecs.BOM_UTF8).strip()
     if re.fullmatch(rb"[0-9A-Fa-f]{64}", text):
         return bytes.fromhex(text.decode())
     is_text = data.isascii() and data.decode().isprintable()  # a passphrase, or half of a key

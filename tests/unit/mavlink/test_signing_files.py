@@ -32,7 +32,8 @@ def make_store(folder, data=KEY):
 
 
 @pytest.mark.parametrize(
-    "data", [KEY, KEY.hex().encode(), b" " + KEY.hex().upper().encode() + b"\n"]
+    "data",
+    [KEY, KEY.hex().encode("utf-8-sig"), b" " + KEY.hex().upper().encode() + b"\n"],
 )
 def test_a_key_is_32_bytes_or_64_hexadecimal_digits(data, tmp_path):
     assert read_key(write_key(tmp_path, data)) == KEY
@@ -67,7 +68,9 @@ def test_a_key_that_is_not_there_is_refused_with_the_way_to_make_one(tmp_path):
         read_key(tmp_path)
 
 
-def test_a_key_of_zeros_and_a_pipe_are_refused(tmp_path):
+def test_a_key_in_utf_16_one_of_zeros_and_a_pipe_are_refused(tmp_path):
+    with pytest.raises(UserError, match="is text in UTF-16 or UTF-32: save it as UTF-8"):
+        read_key(write_key(tmp_path, KEY.hex().encode("utf-16")))
     with pytest.raises(UserError, match="shall not sign"):
         read_key(write_key(tmp_path, bytes(32)))
     os.mkfifo(tmp_path / "pipe", 0o600)
