@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 from policy.adapters.interface import Interface, read_interface
 from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
-from policy.files import CONTRACT_FILE, last_line, parse_json, read_text, stand_in, why_unreadable
+from policy.files import (
+    CONTRACT_FILE,
+    decode_text,
+    last_line,
+    parse_json,
+    read_text,
+    stand_in,
+    why_unreadable,
+)
 
 if TYPE_CHECKING:
     import openvino as ov
@@ -109,7 +117,7 @@ def read_description(spec: str, path: Path, contract_file: Path | None) -> Descr
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
             extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
-            text = archive.read(extra[0]).decode() if extra else None
+            data = archive.read(extra[0]) if extra else None
     except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
         raise CheckpointError(f"--policy {spec}: {why_unreadable(path, error)}") from error
     if not any("/code/" in name for name in names):
@@ -118,6 +126,10 @@ def read_description(spec: str, path: Path, contract_file: Path | None) -> Descr
             "torch.jit.script(module).save(FILE), or torch.jit.trace"
         )
     where = path / DESCRIPTION
+    try:
+        text = None if data is None else decode_text(data)
+    except ValueError as error:
+        raise CheckpointError(f"{where} cannot be read: {error}") from error
     return describe(spec, text, where=where, beside=path.parent, contract_file=contract_file)
 
 

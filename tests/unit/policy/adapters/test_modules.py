@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -171,6 +172,13 @@ def test_arguments_in_another_order_are_refused(tmp_path: Path, module: nn.Modul
         load(f"torchscript:{path}")
 
 
+def zipped(description: bytes) -> bytes:
+    with zipfile.ZipFile(content := io.BytesIO(), "w") as file:
+        file.writestr("mine/code/x.py", "")
+        file.writestr("mine/extra/policy.json", description)
+    return content.getvalue()
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -178,6 +186,8 @@ def test_arguments_in_another_order_are_refused(tmp_path: Path, module: nn.Modul
         (b"junk", "cannot be read"),
         (b"", "is empty, or cut short"),
         (weights(), "is not a TorchScript archive"),
+        (zipped(b"\xef\xbb\xbf{}"), "nothing says at which rate"),
+        (zipped("{}".encode("utf-16")), "policy.json cannot be read: it is text in UTF-16"),
     ],
 )
 def test_a_file_that_is_no_archive_is_refused(
