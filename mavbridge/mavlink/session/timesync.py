@@ -7,6 +7,7 @@ from typing import NamedTuple
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import AdviceText
 from mavbridge.mavlink.codec.messages import WRAP_US, Timesync
 
 TIMESYNC_HZ = 5.0
@@ -37,6 +38,8 @@ _DRIFT_PER = 10_000
 """Clocks may drift apart by 1 in 10,000; crystals of autopilots and computers drift by half."""
 _UNSTEADY_PER = 200
 """A clock that is off by more than 1 in 200 has stepped, or runs unevenly."""
+_TRUST_NS = 5 * NS_PER_S
+"""Longest wait for agreeing exchanges before the user is told; a slow clock is known by then."""
 _UNEVEN_NS = 10 * NS_PER_MS
 """Harmless unevenness: the clock of ArduPilot's SITL advances in steps of 6 ms, and was seen to
 waver by as much against the wall clock."""
@@ -64,7 +67,7 @@ class TimesyncFilter:
     """
 
     def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
-        """``report`` tells the user once that the vehicle's clock is slow."""
+        """``report`` tells the user once why the vehicle's stamps are not trusted."""
         self._report = report
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._best: _Exchange | None = None
@@ -74,14 +77,16 @@ class TimesyncFilter:
         self._clocks: deque[tuple[int, int]] = deque()
         """Arrival and vehicle time of the newest answers."""
         self.round_trips = Histogram()
-        self._has_told_pace = False
+        self._trusted_ns: int | None = None
+        """Last request with a good offset, or else the first one; None before it."""
+        self._has_told = False
 
     def restart(self) -> None:
         """Forget the offset after a reboot or a change of vehicle."""
         self._outstanding.clear()
         self._sending_ns.clear()
         self._clocks.clear()
-        self._best, self._agreeing = None, 0
+        self._best, self._agreeing, self._trusted_ns = None, 0, None
 
     def request(self, now_ns: int, early_ns: int = 0) -> int | None:
         """Return the ts1 of the request that is due now or within ``early_ns``, else None."""
@@ -89,6 +94,13 @@ class TimesyncFilter:
             return None
         self._next_ns = now_ns + period_ns(TIMESYNC_HZ)
         self._outstanding.append(now_ns)
+        if self.is_good or self._trusted_ns is None:
+            self._trusted_ns = now_ns
+        elif not self._has_told and now_ns - self._trusted_ns > _TRUST_NS:
+            self._has_told = True
+            fault = "answers disagree" if self._clocks else "is not answered (a router drops it?)"
+            effect = "ages count from arrival, so a delay of the link is not seen"
+            self._report(AdviceText(f"TIMESYNC {fault}: {effect}"))
         return now_ns
 
     def receive(self, reply: Timesync, arrived_ns: int) -> None:
@@ -116,8 +128,8 @@ class TimesyncFilter:
         self._agreeing += 1
         sending_ns = reply.tc1 - best.offset_ns - reply.ts1
         self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
-        if not self._has_told_pace and (slow := self.slow_clock) is not None:
-            self._has_told_pace = True
+        if not self._has_told and (slow := self.slow_clock) is not None:
+            self._has_told = True
             self._report(str(slow))
 
     @property

@@ -244,6 +244,29 @@ def test_a_clock_that_is_not_slow_all_the_time_is_not_called_slow(
     assert paced_timesync(pace_at).slow_clock is None
 
 
+@pytest.mark.parametrize(
+    ("is_answered", "offset_at", "told"),
+    [
+        (False, lambda _: BOOT_NS, ["TIMESYNC is not answered"]),
+        (True, lambda at_ns: BOOT_NS + at_ns % (3 * S // 5) // 8, ["TIMESYNC answers disagree"]),
+        (True, lambda _: BOOT_NS, []),
+        (True, lambda at_ns: BOOT_NS - at_ns // 2, ["the vehicle's clock runs at 0.5"]),
+    ],
+)
+def test_stamps_that_stay_untrusted_are_told_once(
+    is_answered: bool, offset_at: Callable[[int], int], told: list[str]
+) -> None:
+    texts: list[str] = []
+    sync = TimesyncFilter(texts.append)
+    for at_ns in range(S, 30 * S, S // 5):
+        if is_answered:
+            exchange(sync, at_ns, up_ns=0, down_ns=NS_PER_MS, offset_ns=offset_at(at_ns))
+        else:
+            sync.request(at_ns)
+    assert len(texts) == len(told)
+    assert all(map(str.startswith, texts, told))
+
+
 def test_things_happened_when_the_vehicle_says_once_the_offset_is_good() -> None:
     assert TimesyncFilter().happened_ns(boot_us(9 * S), 10 * S) == 10 * S
     sync = good_timesync()
