@@ -43,8 +43,7 @@ from mavbridge.mavlink.session.discovery import (
     VehicleDiscovery,
     VehicleIdentity,
 )
-from mavbridge.mavlink.session.stats import LinkCounters
-from mavbridge.mavlink.session.telemetry import TelemetryCollector
+from mavbridge.mavlink.session.telemetry import LinkCounters, TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import REFUSED_NS, Address, Connection, Transport
@@ -234,13 +233,23 @@ class MavlinkLink:
 
     def stats(self) -> LinkStats:
         """Return the counters for the report."""
-        output = self._sender.output
-        return self._counters.stats(
-            self._timesync,
-            echo_confirmed=output is not None and output.was_confirmed,
+        counters, timesync, output = self._counters, self._timesync, self._sender.output
+        sent, slow_clock = counters.sent, timesync.slow_clock
+        error_ns = timesync.error_ns(counters.heard_ns)
+        saturated = sorted(output.saturated.items()) if sent and output is not None else ()
+        return LinkStats(
+            messages_per_s=counters.messages_per_s,
+            lost_fraction=counters.lost_fraction,
+            rtt_ms=timesync.round_trips.percentiles_ms(),
+            sent_overrides=sent,
+            echo_confirmed=output.was_confirmed if sent and output is not None else None,
             unusable_packets=self._codec.bad_data_count,
             refused_signatures=self._codec.refused_signatures,
-            saturated={} if output is None else output.saturated,
+            saturated=tuple((name, count / sent) for name, count in saturated),
+            vehicle_clock_offset_ns=timesync.offset_ns,
+            is_timesync_good=timesync.is_good,
+            slow_clock=None if slow_clock is None else str(slow_clock),
+            timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,
         )
 
     @property

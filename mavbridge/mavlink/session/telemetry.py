@@ -1,9 +1,9 @@
-"""Newest reading of each quantity, from the best message that carries it."""
+"""Newest reading of each quantity, and counters of the messages that carry them."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import ForwardedPacket, Reading, Sample, Telemetry
 from mavbridge.mavlink.codec.messages import (
     Altitude,
@@ -82,6 +82,56 @@ class TelemetryCollector:
         new = {name: Reading(arrived_ns, each, delay_ns) for name, each in values.items()}
         self.telemetry = self.telemetry._replace(**new)
         return tuple(map(Sample._make, new.items()))
+
+
+_MOST_OVERTAKEN = 16
+"""Largest number of messages that overtake one; a longer step back is an outage."""
+
+
+class LinkCounters:
+    """Counters of messages and losses of the chosen vehicle."""
+
+    def __init__(self) -> None:
+        self._by_name: Counter[str] = Counter()
+        self._last_sequence: int | None = None
+        self._lost = 0
+        self._first_ns: int | None = None
+        self.heard_ns = 0
+        """Arrival of the newest message; 0 before the first."""
+        self.sent = 0
+
+    def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
+        """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256).
+
+        An overtaken message fills the gap that it left; a doubled one leaves none.
+        """
+        self._by_name[name] += 1
+        last = self._last_sequence
+        ahead = 1 if last is None else (sequence - last) % 256
+        if ahead >= 256 - _MOST_OVERTAKEN:
+            self._lost = max(self._lost - 1, 0)
+        elif ahead > 0:
+            self._lost += ahead - 1
+            self._last_sequence = sequence
+        self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
+        self.heard_ns = arrived_ns
+
+    def new_sequence(self) -> None:
+        """Accept any sequence number next: the sender has restarted."""
+        self._last_sequence = None
+
+    @property
+    def messages_per_s(self) -> tuple[tuple[str, float], ...]:
+        """Mean arrival rate by message name; empty before two arrivals."""
+        span_ns = self.heard_ns - (self._first_ns or 0)
+        counts = sorted(self._by_name.items()) if span_ns > 0 else ()
+        return tuple((name, count * NS_PER_S / span_ns) for name, count in counts)
+
+    @property
+    def lost_fraction(self) -> float | None:
+        """Share of the vehicle's messages that were lost; None before the first."""
+        received = self._by_name.total()
+        return self._lost / (self._lost + received) if received else None
 
 
 def samples_of(
