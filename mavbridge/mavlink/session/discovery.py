@@ -171,6 +171,11 @@ class VehicleDiscovery:
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
                 "the vehicle's own port, or have the ground station forward it"
             )
+        if connection.loss:
+            advice = (
+                "plug it in" if isinstance(address, SerialAddress) else "is its server running?"
+            )
+            return f"the connection is lost ({connection.loss}): {advice}"
         amount = f"{connection.received_bytes / 1000 / max(waited_s, 0.1):.1f} kB/s came"
         if connection.received_packets:
             return (

@@ -118,8 +118,8 @@ class Connection:
         which have none to test."""
         self._told_signatures = 0
         """Number of kinds of rejected signatures that were reported."""
-        self._told_loss = ""
-        """Last report of a lost connection; empty once bytes have come again."""
+        self.loss = ""
+        """Cause of the last lost connection; empty once bytes have come again."""
         self._opened = 0
         self._open(clock.now_ns())
 
@@ -167,10 +167,9 @@ class Connection:
     def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + REOPEN_NS
-        text = f"connection lost ({error}); reconnecting"
-        if text != self._told_loss:
-            self._told_loss = text
-            self.report(text)
+        if str(error) != self.loss:
+            self.loss = str(error)
+            self.report(f"connection lost ({error}); reconnecting")
 
     def receive(self) -> Iterator[Arrival]:
         """Yield the messages that have arrived; reopen the transport when that is due."""
@@ -182,7 +181,7 @@ class Connection:
         try:
             for data, arrived_ns, sender in self._transport.drain():
                 self.received_bytes += len(data)
-                self._told_loss = ""
+                self.loss = ""
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data, sender):

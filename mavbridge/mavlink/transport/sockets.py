@@ -353,7 +353,7 @@ def _serial_obstacle(device: str, error: Exception) -> str:
     text, code = str(error), getattr(error, "errno", None)
     if code == errno.EACCES:
         return "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
-    if code == errno.ENOTTY or "ioctl" in text:  # pyserial may hide the number
+    if code in (errno.ENOTTY, errno.EISDIR) or "ioctl" in text:  # pyserial may hide the number
         return "it is no serial port"
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return f"it is in use; {_HOLDER} (fuser {device} names it)"

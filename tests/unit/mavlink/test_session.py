@@ -148,12 +148,13 @@ def test_other_senders_are_described(
 
 
 def hearing(
-    spec: str, received_bytes: int = 0, received_packets: int = 0
+    spec: str, received_bytes: int = 0, received_packets: int = 0, loss: str = ""
 ) -> tuple[LinkAddress, float, Any, int]:
     heard = SimpleNamespace(
         obstacles=lambda _now_ns: [],
         received_bytes=received_bytes,
         received_packets=received_packets,
+        loss=loss,
     )
     return parse_address(spec), 5.0, heard, 0
 
@@ -165,6 +166,8 @@ def hearing(
         (hearing("/dev/ttyACM0,921600", 30_000), ("6.0 kB/s came", "baud rate than 921600")),
         (hearing("/dev/ttyACM0,921600", 30_000, 9), ("without a heartbeat",)),
         (hearing("tcp:127.0.0.1:5760"), ("not a byte", "one client on TCP 5760")),
+        (hearing("/dev/ttyACM0", 0, 0, "gone"), ("connection is lost (gone): plug it in",)),
+        (hearing("tcp:127.0.0.1:5760", 99, 0, "ended"), ("lost (ended): is its server running?",)),
         (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "another program")),
         (hearing("udp:127.0.0.1:14550"), ("send to port 14550",)),
         (hearing("udpout:127.0.0.1:14550"), ("nobody answered",)),
