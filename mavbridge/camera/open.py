@@ -1,5 +1,6 @@
 """Opening of the camera named by ``--camera``."""
 
+import stat
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,6 +45,7 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
             or stamps its frames itself and ``latency_ms`` is not 0.
     """
     kind, _, rest = spec.partition(":")
+    mode = _file_mode(spec)
     if kind == "shm":
         if latency_ms != 0.0:
             raise UserError(
@@ -56,7 +58,9 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
         parse_jpeg_udp(rest)
     elif kind == "screen":
         require_packages("--camera screen:", SCREEN_PACKAGES)
-    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or Path(spec).is_file()):
+    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or stat.S_ISREG(mode)):
+        if stat.S_ISFIFO(mode):
+            raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
 
@@ -72,16 +76,26 @@ def require_present(spec: str) -> None:
 
 
 def _is_device(spec: str) -> bool:
-    """True for a number, and for anything under /dev but regular files.
+    """True for a number, a device or a link to one, and anything under /dev but regular files.
 
     udev's names are links to devices; a dangling link is an unplugged camera.
     """
-    return spec.isdecimal() or (spec.startswith("/dev/") and not Path(spec).is_file())
+    mode = _file_mode(spec)
+    is_udevs = spec.startswith("/dev/") and not stat.S_ISREG(mode)
+    return spec.isdecimal() or is_udevs or stat.S_ISCHR(mode)
+
+
+def _file_mode(spec: str) -> int:
+    """Return the kind of a file, as ``os.stat`` has it; 0 if there is none of this name."""
+    try:
+        return Path(spec).stat().st_mode
+    except (OSError, ValueError):
+        return 0
 
 
 def _is_stream(spec: str) -> bool:
     return spec.startswith(STREAM_SCHEMES) or (
-        spec.lower().endswith(".sdp") and Path(spec).is_file()
+        spec.lower().endswith(".sdp") and stat.S_ISREG(_file_mode(spec))
     )
 
 

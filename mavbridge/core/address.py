@@ -28,9 +28,9 @@ _HOST_PORT = r"(?:\[([0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*(?:%[^\]\s/]+)?)\]|([^:/\s\[\]
 _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
 _NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?{_HOST_PORT}/?", re.ASCII)
 _BRACKETS = "an IPv6 address goes into brackets, as in udp:[::1]:14550; "
-_SERIAL = re.compile(r"(?:serial:(?://)?)?(/dev/[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
-"""A device name may hold colons (/dev/serial/by-path/...): only four or more digits are a baud
-rate."""
+_SERIAL = re.compile(r"(?:serial:(?://)?)?([^,:/]*/(?!/)[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
+"""Any path with a slash: a device may have links elsewhere. Its name may hold colons
+(/dev/serial/by-path/...): only four or more digits are a baud rate."""
 
 
 SocketAddress: TypeAlias = tuple[str, int, *tuple[int, ...]]

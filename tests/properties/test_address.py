@@ -86,6 +86,9 @@ def test_whatever_is_written_is_an_address_or_told_the_forms(text: str) -> None:
         ("tcpout://[2001:db8::1]:5760/", TcpAddress("2001:db8::1", 5760)),
         ("COM3,115200", SerialAddress("COM3", 115200)),
         ("COM3:115200", SerialAddress("COM3", 115200)),
+        ("/tmp/ttyV0:115200", SerialAddress("/tmp/ttyV0", 115200)),
+        ("./tty,115200", SerialAddress("./tty", 115200)),
+        ("serial:///run/fc", SerialAddress("/run/fc", 57600)),
         (
             "/dev/serial/by-path/usb-0:1:1.0",
             SerialAddress("/dev/serial/by-path/usb-0:1:1.0", 57600),

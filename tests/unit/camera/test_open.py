@@ -1,3 +1,4 @@
+import os
 import sys
 import threading
 from pathlib import Path
@@ -47,6 +48,17 @@ def test_live_sources(source, monkeypatch):
     if "://" in str(source):
         expected = ("open_stream", source, None, None)
     assert asked[0] == expected
+
+
+def test_a_device_is_known_by_its_kind_and_a_named_pipe_is_told_of_another_way(tmp_path):
+    link, fifo = tmp_path / "front_cam", tmp_path / "fifo"
+    link.symlink_to("/dev/null")
+    os.mkfifo(fifo)
+    check_camera(str(link))
+    check_camera("rtsp://host/" + 300 * "x")
+    for name, told in ((fifo, "'pipe:cat .*fifo'"), (300 * "x", "no such file")):
+        with pytest.raises(UserError, match=told):
+            check_camera(str(name))
 
 
 @pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
