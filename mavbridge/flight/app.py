@@ -337,11 +337,8 @@ class _Flight:
                 until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
             if is_holding and not is_told:
                 is_told = True
-                screen.show_message(
-                    "without a receiver silence is a failsafe: neutral sticks continue until the "
-                    "vehicle is disarmed or its mode is changed; after Ctrl-C the guard (process "
-                    f"{self._guard.pid}) continues alone"
-                )
+                holder = f"the guard (process {self._guard.pid})"
+                screen.show_message(f"after Ctrl-C {holder} sends neutral sticks alone")
             if stop.requests > asked or self._clock.now_ns() > until_ns:
                 break
         if self._has_hung:

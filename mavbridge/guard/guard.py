@@ -116,6 +116,15 @@ class Guard:
         """Outcome of the flights so far."""
         return self._engagement.outcome
 
+    @property
+    def ways_out(self) -> str:
+        """What a hand can do to end the neutral sticks of HOLDING, in words."""
+        # PX4 ignores the transmitter's own switches while our sticks flow.
+        is_px4 = self._seen is not None and self._seen.link.modes.override
+        place = " by a ground station" if is_px4 else ""
+        switch = ", or put the engage switch low" if self._engagement.heeds_switch else ""
+        return f"you disarm or change the mode{place}{switch}"
+
     def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:
         """Yield delay [ns], decision and requested mode of each last word, if the guard dies."""
         if self._seen is None:

@@ -366,8 +366,9 @@ class GuardLoop:
                 text = "the policy has control"
             case Phase.LEAVING:
                 text = f"neutral: {tick.reason}"
-            case Phase.HOLDING:
-                text = "neutral sticks go on until you disarm or change the mode"
+            case Phase.HOLDING if self._guard is not None:
+                text = f"neutral sticks go on until {self._guard.ways_out}"
+                self._flight.send(encode_from_guard(text))
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
                 text = f"control given back: {tick.reason}"
         if text is not None:

@@ -155,10 +155,13 @@ class Memory:
         self._note_end(cause)
         self.reason = cause.reason
         self.must_stop = cause != self.end_request
-        self.heeds_switch = not (self.switch.is_off or self.settings.is_setpoint)
         if cause.end == "takeover":
             self.seen_interruptions = now.link.interruptions
         self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal
+        # PX4 ignores the transmitter's own switches until its receiver follows our sticks.
+        has_fallback = bool(now.link.modes.override) and not self.disengage.is_silence_failsafe
+        has_switch = self.settings.engage_channel is not None and not self.switch.is_off
+        self.heeds_switch = has_fallback and has_switch and not self.settings.is_setpoint
         self.heard_ns = now.now_ns
 
     def leave_for_good(self, now: EngagementInputs, cause: EndRequest) -> None:

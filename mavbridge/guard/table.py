@@ -297,9 +297,7 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return now.link.problem
     if now.link.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
-    # PX4 ignores the transmitter's own switches until its receiver follows our sticks.
-    has_fallback = bool(now.link.modes.override) and not m.disengage.is_silence_failsafe
-    is_held = m.phase in (LEAVING, HOLDING) and m.heeds_switch and has_fallback
+    is_held = m.phase in (LEAVING, HOLDING) and m.heeds_switch
     if m.switch.is_off and (m.phase is FLYING or (is_preparing and m.is_act) or is_held):
         return _switch_off(m)
     if not now.status.armed and not is_preparing:

@@ -14,6 +14,7 @@ from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
 from mavbridge.guard.values import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
+from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind
 from policy.motion.controllers import Motion, Program, Push
@@ -179,9 +180,14 @@ def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     ],
 )
 def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_the_switch(
-    end: Callable[[OutputFlight], None] | None, throttle_us: int, mode: str
+    monkeypatch: pytest.MonkeyPatch,
+    end: Callable[[OutputFlight], None] | None,
+    throttle_us: int,
+    mode: str,
 ) -> None:
     """Until then it ignores the transmitter's switches too, but for our engage switch."""
+    said: list[str] = []
+    monkeypatch.setattr(MavlinkLink, "announce", lambda link, text: said.append(text))
     flight = OutputFlight("px4", "sticks", engage_channel=5)
     mapped = {f"RC_MAP_{axis}": k for k, axis in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)}
     for name, value in {"COM_RC_IN_MODE": 6, **mapped}.items():
@@ -199,6 +205,8 @@ def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_th
         flight.run(1.2)
         assert flight.px4.mode_name == mode, flight.describe()
         assert (flight.phase is Phase.HOLDING) is (throttle_us == 1000)
+        ways = "disarm or change the mode by a ground station, or put the engage switch low"
+        assert any(text.endswith(ways) for text in said) is (throttle_us == 1000)
     flight.vehicle.set_receiver((*sticks_us, 1000))
     flight.run(0.8)
     assert flight.px4.stick_input.source == RC_SOURCE, flight.describe()

@@ -226,6 +226,7 @@ def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
     rig.run(0.5)
     assert rig.ticks[-1].phase is Phase.HOLDING
     assert rig.link.is_engaged
+    assert rig.texts[-1].startswith("neutral sticks go on until")  # the screen is told too
     rig.link.change(mode="LOITER")
     rig.run(0.5)
     assert rig.link.announced == [
