@@ -207,6 +207,8 @@ class VehicleStatus:
     """The estimator's own verdict on its horizontal position; None: not reported."""
     battery_problem: Reason | None = None
     """Why the battery counts as low or failed; None: it does not."""
+    is_charge_known: bool = True
+    """False if ``envelope.min_battery`` is set and no charge is reported to compare with it."""
     stick_override_ns: int | None = None
     """When it last reported that moving sticks have changed its mode."""
 

@@ -120,6 +120,8 @@ class Envelope:
         lost = self._had_position and status.is_position_valid is False
         self._note("estimator", because(Code.ESTIMATOR_LOST) if lost else None, now_ns, FLAG_NS)
         self._note("battery", status.battery_problem, now_ns, FLAG_NS)
+        if not status.is_charge_known:
+            self._ignore("min_battery", "the vehicle reports no charge")
         if status.is_landed is None:
             self._ignore("landing", "the vehicle does not say whether it is in the air")
         self._was_in_air |= status.armed and status.is_landed is False

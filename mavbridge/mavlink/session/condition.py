@@ -217,6 +217,7 @@ class VehicleCondition:
             position_ned_m=self._position_ned_m(now_ns, is_valid),
             is_position_valid=is_valid,
             battery_problem=self._battery_problem(now_ns),
+            is_charge_known=self._is_charge_known(now_ns),
             stick_override_ns=self._stick_override_ns,
         )
 
@@ -253,6 +254,11 @@ class VehicleCondition:
             percent, limit = system.battery_percent, self._min_battery_percent
             return because(Code.BATTERY_BELOW, percent=percent, limit=limit)
         return None
+
+    def _is_charge_known(self, now_ns: int) -> bool:
+        system = self._last(SystemStatus, now_ns)
+        is_reported = system is not None and system.battery_percent >= 0
+        return is_reported or self._min_battery_percent <= 0
 
     def _last(
         self, kind: type[_T], now_ns: int | None = None, most_ns: int = SLOW_FRESH_NS

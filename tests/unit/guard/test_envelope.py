@@ -105,13 +105,14 @@ def test_what_has_no_data_is_said_to_be_not_watched() -> None:
     flight = Flight()
     flight.attitude = flight.velocity = None
     nothing = {"position_ned_m": None, "is_position_valid": None, "is_landed": None}
-    assert flight.run(1.0, **nothing) is None
+    assert flight.run(1.0, is_charge_known=False, **nothing) is None
     assert flight.envelope.unwatched == [
         "tilt is not watched: no fresh attitude",
         "speed is not watched: no valid velocity",
         "height is not watched: no valid position",
         "distance is not watched: no valid position",
         "estimator is not watched: it reports no valid position",
+        "min_battery is not watched: the vehicle reports no charge",
         "landing is not watched: the vehicle does not say whether it is in the air",
     ]
 

@@ -163,6 +163,14 @@ TOLD: list[Told] = [
     (("ardupilot",), [Event(FAILSAFE_HOLD)], {"is_failsafe": False}),
     (BOTH, [], {"is_landed": None, "is_position_valid": None, "battery_problem": None}),
     *(
+        (BOTH, told, {"is_charge_known": is_known})
+        for told, is_known in (
+            ([], False),
+            ([battery(1, 1, -1)], False),
+            ([battery(0, 0, 0)], True),
+        )
+    ),
+    *(
         (BOTH, [LandedState(state)], {"is_landed": is_landed})
         for state, is_landed in enumerate((None, True, False, False, False))
     ),
