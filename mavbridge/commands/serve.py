@@ -143,10 +143,9 @@ class PolicyServer:
             return connection.respond(http.HTTPStatus.FORBIDDEN, "this serves no web pages\n")
         if request.path == HEALTH_PATH:
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        given = request.headers.get("Authorization", "")
-        if self._api_key is None or hmac.compare_digest(
-            given.encode(), f"Api-Key {self._api_key}".encode()
-        ):
+        given, key = request.headers.get_all("Authorization"), f"Api-Key {self._api_key}".encode()
+        is_single = len(given) == 1
+        if self._api_key is None or (is_single and hmac.compare_digest(given[0].encode(), key)):
             return None
         self._report(f"{_name(connection)} was refused: it has not the API key")
         return connection.respond(http.HTTPStatus.UNAUTHORIZED, "the API key is missing or wrong\n")

@@ -449,8 +449,10 @@ def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch)
             monkeypatch.setenv(link.API_KEY_VARIABLE, key)
             with pytest.raises(PolicyError, match=r"wants an API key.* MAVBRIDGE_API_KEY"):
                 load_server_policy(url, None)
-        with pytest.raises(InvalidStatus, match="401"):
-            connect(port, Authorization="Api-Key other").__enter__()
+        twice = dict.fromkeys(("Authorization", "authorization"), "Api-Key secret")
+        for headers in ({"Authorization": "Api-Key other"}, twice):
+            with pytest.raises(InvalidStatus, match="401"):
+                connect(port, **headers).__enter__()
         monkeypatch.setenv(link.API_KEY_VARIABLE, "secret")
         assert read_policy_contract(PolicyRequest(spec=url)).image_height == 32
         with connect(port, Authorization="Api-Key secret") as client:

@@ -183,7 +183,7 @@ def from_message(
 def _array(
     message: Message, key: str, shape: tuple[int, ...], kind: str, finite: int | None = None
 ) -> NDArray[np.generic]:
-    """Return an array of the request; its first ``finite`` rows, or all, must be finite."""
+    """Return an array of the request, finite as float32; NaN may follow ``finite`` rows."""
     array = number_array(message, key)
     is_kind = array.dtype == np.uint8 if kind == "u" else array.dtype.kind == kind
     if not is_kind or array.shape != shape:
@@ -191,8 +191,11 @@ def _array(
         raise MessageError(
             f"{key!r} must be {wanted} {list(shape)}, got {array.dtype} {list(array.shape)}"
         )
-    if kind == "f" and not np.isfinite(array[:finite]).all():
-        raise MessageError(f"{key!r} holds NaN or infinity")
+    if kind == "f":
+        with np.errstate(over="ignore"):
+            numbers = array.astype(np.float32)
+        if np.isinf(numbers).any() or np.isnan(numbers[:finite]).any():
+            raise MessageError(f"{key!r} holds NaN, or a number beyond float32")
     return array
 
 

@@ -230,6 +230,7 @@ def test_keys_and_names_are_those_of_the_contract_file() -> None:
         ({"observation.state": np.zeros(12, np.float32)}, r"float32 \[13\], got float32 \[12\]"),
         ({"observation.state": np.full(13, np.nan, np.float32)}, "NaN"),
         ({"action_history": np.full((4, 4), np.nan, np.float32)}, "NaN"),
+        ({"observation.state": np.full(13, 1e300)}, "float32"),
         ({"observation.images.front": np.zeros((16, 24, 3), np.float32)}, "uint8"),
         ({"observation.images.front": np.zeros((16, 24, 3), np.uint16)}, "uint8"),
         ({"observation.images.front": np.zeros((3, 16, 24), np.uint8)}, r"\[16, 24, 3\]"),
