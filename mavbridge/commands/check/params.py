@@ -8,21 +8,17 @@ from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ActionKind
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.mavlink.profiles.profile import (
-    ParamContext,
-    ParamNote,
-    Profile,
-    StreamGroup,
-)
+from mavbridge.mavlink.profiles.profile import ParamNote, Profile, StreamGroup
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_risks
+from mavbridge.mavlink.session.params.checks import Assessment
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 
 _STICK_OUTPUTS = ("rc-override", "manual-control")
 _NOT_SENT = "not sent"
+_REFUSED = ("obstacle", "risk")
+"""Kinds of notes for which a flight is refused."""
 _row = partial(CheckRow, "parameters")
 
 
@@ -35,7 +31,6 @@ class Terms:
     plan: FlightPlan | None
     """None: no policy."""
     vehicle: VehicleSession
-    has_receiver: bool | None
     is_deaf: bool
     """True if the vehicle has answered nothing: no parameter, version or TIMESYNC."""
 
@@ -45,22 +40,6 @@ class Terms:
         return self.vehicle.profile
 
     @cached_property
-    def context(self) -> ParamContext:
-        """Output, system id, receiver, accepted risks and serial port of the flight."""
-        link = self.config.link
-        kind: ActionKind = "sticks" if self.contract is None else self.contract.action
-        output = self.profile.usual_output(kind) if link.output == "auto" else link.output
-        serial = serial_risks(self.settings, self.streams)
-        return ParamContext(
-            output,
-            link.source_system,
-            self.has_receiver,
-            self.vehicle.version,
-            link.accept_risk,
-            serial,
-        )
-
-    @cached_property
     def values(self) -> dict[str, float]:
         """Parameters of the flight, including those of --set."""
         return {**self.vehicle.params.values, **dict(self.config.link.set_params)}
@@ -68,7 +47,7 @@ class Terms:
     @property
     def is_sticks(self) -> bool:
         """True if the actions are sticks rather than setpoints."""
-        return self.context.output in _STICK_OUTPUTS
+        return self.assessment.context.output in _STICK_OUTPUTS
 
     @property
     def contract(self) -> Contract | None:
@@ -92,45 +71,30 @@ class Terms:
     @cached_property
     def assessment(self) -> Assessment:
         """Judgement of the parameters for this flight."""
-        return assess(self.profile, self.values, self.context)
-
-    def refusals(self) -> list[ParamNote]:
-        """Return notes for which the flight is refused."""
-        notes = list(self.assessment.obstacles)
-        if self.assessment.unusable is not None:
-            unusable = because(Code.CALIBRATION_UNUSABLE, cause=self.assessment.unusable)
-            notes.append(ParamNote("obstacle", (), str(unusable)))
-        return notes + list(self.assessment.risks)
+        return self.vehicle.params.assessment_with(self.config.link.set_params)
 
 
 def param_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield every relevant parameter, then the motion at full stick."""
-    refusals = terms.refusals()
-    warnings = [note for note in terms.assessment.notes if note.kind in ("advice", "hint")]
-    told: list[ParamNote] = []
-    wanted = terms.profile.wanted_params(terms.values, terms.context)
-    for name, should_be in wanted.items():
-        about = [note for note in refusals + warnings if name in note.names and note not in told]
-        told += about
+    notes = list(terms.assessment.notes)
+    if (cause := terms.assessment.unusable) is not None:
+        unusable = because(Code.CALIBRATION_UNUSABLE, cause=cause)
+        notes.append(ParamNote("obstacle", (), str(unusable)))
+    wanted = terms.profile.wanted_params(terms.values, terms.assessment.context)
+    rows: dict[str, list[ParamNote]] = {name: [] for name in wanted}
+    for note in sorted(notes, key=lambda note: note.kind not in _REFUSED):
+        own = note.names[0] if note.names else "settings"
+        rows.setdefault(next((name for name in wanted if name in note.names), own), []).append(note)
+    for name, about in rows.items():
         text = "; ".join(note.text for note in about)
-        is_refused = any(note in refusals for note in about)
         yield _row(
             name,
-            _found(terms, name),
-            should_be,
+            _found(terms, name) if name in wanted else "see below",
+            wanted.get(name, ""),
             warn=text,
-            no_go=text if is_refused else "",
+            no_go=text if any(note.kind in _REFUSED for note in about) else "",
             commands=cures(about),
         )
-    for note in refusals + warnings:
-        if note not in told:
-            yield _row(
-                note.names[0] if note.names else "settings",
-                "see below",
-                warn=note.text,
-                no_go=note.text if note in refusals else "",
-                commands=cures([note]),
-            )
     yield from _curve_rows(terms)
     if terms.contract is not None and terms.contract.action in ("rates", "attitude"):
         hover = terms.values.get(terms.profile.hover_param)

@@ -196,7 +196,6 @@ def check_vehicle(
                 settings=settings,
                 plan=plan,
                 vehicle=vehicle,
-                has_receiver=snapshot.status.has_receiver if snapshot.status else None,
                 is_deaf=not (vehicle.version or vehicle.params.values or stats.rtt_ms),
             )
             rows += _link_rows(vehicle, stats, terms, unfinished)
@@ -283,7 +282,7 @@ def _rate_row(
 
 def _echo_row(probe: VehicleProbe, terms: Terms) -> CheckRow:
     """Send neutral sticks unless the vehicle is armed; return a row with the vehicle's response."""
-    name, expected = "echo test", f"our sticks from system {terms.context.source_system}"
+    name, expected = "echo test", f"our sticks from system {terms.assessment.context.source_system}"
     if not terms.is_sticks:
         text = "not sent: the vehicle shows setpoints only in their mode"
         return _link_row(name, text, "actions that are sticks")

@@ -1,7 +1,7 @@
 """Parameters of one vehicle: known values, demands of the flight, and changes for it."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.link_settings import LinkSettings
@@ -233,6 +233,10 @@ class VehicleParams:
         if output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
         return assessment.risks[0].refusal if assessment.risks else None
+
+    def assessment_with(self, values: Iterable[tuple[str, float]]) -> Assessment:
+        """Return the assessment for the present output and receiver, as if these were set."""
+        return assess(self._profile, self.values | dict(values), self._context)
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
         """Return the assessment of the present values, output and receiver."""
