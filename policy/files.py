@@ -4,6 +4,7 @@ import codecs
 import errno
 import json
 import os
+import re
 import stat
 import tomllib
 from collections.abc import Iterator
@@ -23,6 +24,8 @@ MAX_TOML_LINE = 2_000
 """Longest line [characters]. Time and memory of ``tomllib`` grow with the square of the dots in a
 key, and a key ends with its line: 200 kB of ``a.a.a`` took more than 10 GB."""
 _HEAD_BYTES = 4096
+_HUGE = re.compile(r"(?:\d_?){309}")
+"""Matches integers that no float can hold; each reader would have to catch its OverflowError."""
 _WIDE_MARKS = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
@@ -174,8 +177,15 @@ def decode_text(data: bytes) -> str:
         raise ValueError(f"it is not UTF-8 text (line {line}): save it as UTF-8") from error
 
 
+def _require_small_numbers(text: str) -> None:
+    if (found := _HUGE.search(text)) is not None:
+        line = text.count("\n", 0, found.start()) + 1
+        raise ValueError(f"a number in it has more than 308 digits (line {line})")
+
+
 def parse_json(text: str) -> Any:
-    """Parse JSON; raise ValueError for deep nesting too."""
+    """Parse JSON; raise ValueError for deep nesting and integers that no float can hold, too."""
+    _require_small_numbers(text)
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -214,7 +224,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         OSError: it cannot be opened.
         ValueError: not UTF-8, larger than MAX_TOML_BYTES, a line longer than MAX_TOML_LINE, not
-            TOML, or nested too deeply.
+            TOML, nested too deeply, or with an integer that no float can hold.
     """
     text = read_text(path, MAX_TOML_BYTES)
     if (longest := max(map(len, text.split("\n")))) > MAX_TOML_LINE:
@@ -222,6 +232,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             f"a line of it has {longest} characters, and may have {MAX_TOML_LINE}: write a long "
             "list over several lines"
         )
+    _require_small_numbers(text)
     try:
         return tomllib.loads(text)
     except RecursionError as error:

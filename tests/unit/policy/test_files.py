@@ -18,9 +18,9 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
             open_regular(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,"])
-def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
-    with pytest.raises(ValueError, match=r"nested too deeply|Expecting value"):
+@pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,", f"{10**400}"])
+def test_json_that_is_too_deep_or_has_huge_numbers_is_a_value_error(text: str) -> None:
+    with pytest.raises(ValueError, match=r"nested too deeply|Expecting value|308 digits"):
         parse_json(text)
 
 
@@ -35,6 +35,7 @@ def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
         (b"a = 1\nb = '\xe4'", "not UTF-8 text .line 2"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
         (b"a = \0", "Invalid"),
+        (b"\na = 1_0" + b"0" * 400, "more than 308 digits .line 2"),
     ],
 )
 def test_settings_that_are_no_text_or_fill_the_memory_are_refused(content, told, tmp_path, capsys):
