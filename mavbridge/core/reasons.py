@@ -56,6 +56,10 @@ class Code(StrEnum):
         "the engage switch (channel {channel}) did not rest low for {rest_s:g} s with a receiver "
         "that works: leave it low for 2 s, then switch it on"
     )
+    ENGAGE_SWITCH_UNSEEN = _vehicle(
+        "no reading of the engage switch (channel {channel}) for {limit_s:g} s: look at the radio "
+        "and at RC_CHANNELS, or start without --engage-channel"
+    )
     ARMED_UNSEEN = _waiting(
         "the vehicle was armed before it was found, or while it was silent: press e"
     )

@@ -32,7 +32,8 @@ class Switch:
         self._rest_ns = DWELL_NS
         self._has_rested = False
         self._since_ns = 0
-        self._newest_ns: int | None = None
+        self.newest_ns: int | None = None
+        """Arrival of the newest reading; None before the first."""
         self.position: Position | None = None
         """Position of the newest reading; None before the first, and after the receiver was
         lost."""
@@ -46,14 +47,14 @@ class Switch:
         if value_us not in RADIO_US:
             return False
         before = self.position
-        if is_late := self._newest_ns is not None and arrived_ns - self._newest_ns > GAP_NS:
+        if is_late := self.newest_ns is not None and arrived_ns - self.newest_ns > GAP_NS:
             self.forget()
         position: Position = (
             "high" if value_us > ON_US else "low" if value_us < OFF_US else "middle"
         )
         if position != self.position:
             self.position, self._since_ns = position, arrived_ns
-        self._newest_ns = arrived_ns
+        self.newest_ns = arrived_ns
         held_ns = arrived_ns - self._since_ns
         if position == "low":
             self.is_off, self.is_on = True, False

@@ -8,7 +8,14 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, Memory, not_engaged
 from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
-from mavbridge.guard.table import PROGRESS, TABLE, Transition, duration_over, objection
+from mavbridge.guard.table import (
+    PROGRESS,
+    TABLE,
+    Transition,
+    duration_over,
+    objection,
+    switch_unseen,
+)
 from mavbridge.guard.values import (
     Actions,
     ControlSource,
@@ -100,7 +107,8 @@ class Engagement(Memory):
                 self.owes_release = False
                 return Actions(control=ControlSource.RELEASE)
             case Phase.WAITING:
-                self.reason = now.link.problem or now.chunk_problem or because(Code.NOT_ENGAGED)
+                problem = now.link.problem or now.chunk_problem or switch_unseen(self, now)
+                self.reason = problem or because(Code.NOT_ENGAGED)
         return Actions()
 
     def _prepare(self, now: EngagementInputs) -> Actions:

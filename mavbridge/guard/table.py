@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.switch import GAP_NS
 from mavbridge.guard.memory import Memory, not_engaged
 from mavbridge.guard.values import EndRequest, EngagementInputs, Phase
 
@@ -37,6 +38,9 @@ NOT_SET = (Code.SET_ABSENT, Code.SET_REFUSED, Code.SET_UNANSWERED)
 """Problems of a link that are over only after another start."""
 LOST_NS = 30 * NS_PER_S
 """Silence of a held vehicle after which it counts as lost, and holding it ends."""
+UNSEEN_NS = 2 * GAP_NS
+"""Time without a reading after which the engage switch counts as dead: 20 periods of RC_CHANNELS at
+the lowest requested rate."""
 
 
 # --- events: pure functions of the memory and the inputs
@@ -74,9 +78,9 @@ def not_set(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
     """an engage command that must be refused
 
-    The vehicle is disarmed, in a failsafe or outside the envelope; the engage switch is low; the
-    mode is not allowed and we may not change it; there is no link or no fresh chunk; or the last
-    flight is still ending.
+    The vehicle is disarmed, in a failsafe or outside the envelope; the engage switch is low or
+    unseen; the mode is not allowed and we may not change it; there is no link or no fresh chunk;
+    or the last flight is still ending.
     """
     if m.act != "engage":
         return None
@@ -172,12 +176,12 @@ def fault(m: Memory, now: EngagementInputs) -> EndRequest | None:
 
     No usable chunk, or no attitude from the vehicle, for longer than [the grace](#the-grace); 5
     malformed chunks (NaN) in a second; the envelope was left; the link was lost; the system has
-    refused our packets for 100 ms; the vehicle does not hear our sticks; a command could not be
-    encoded; the vehicle's clock was set back; the vehicle sends from another address; or ArduPilot
-    keeps the mode in a failsafe.
+    refused our packets for 100 ms; the vehicle does not hear our sticks, sets its clock back or
+    sends from another address; a command could not be encoded; the engage switch is unseen for 1 s;
+    or ArduPilot keeps the mode in a failsafe.
     """
     problem = now.link.problem or now.chunk_fault or now.envelope_problem
-    reason = problem or _failsafe(m, now, keeps_mode=True)
+    reason = problem or _failsafe(m, now, keeps_mode=True) or switch_unseen(m, now)
     return None if reason is None else EndRequest(reason, is_fault=True)
 
 
@@ -263,7 +267,15 @@ def objection(m: Memory, now: EngagementInputs) -> Reason | None:
         return because(Code.FAILSAFE, mode=now.status.mode)
     if m.switch.is_off:
         return _switch_off(m)
-    return now.envelope_problem
+    return switch_unseen(m, now) or now.envelope_problem
+
+
+def switch_unseen(m: Memory, now: EngagementInputs) -> Reason | None:
+    """Return the reason if the engage switch could not take control away, or None."""
+    channel, newest_ns = m.settings.engage_channel, m.switch.newest_ns
+    if channel is None or (newest_ns is not None and now.now_ns - newest_ns <= UNSEEN_NS):
+        return None
+    return because(Code.ENGAGE_SWITCH_UNSEEN, channel=channel, limit_s=UNSEEN_NS / NS_PER_S)
 
 
 def _switch_off(m: Memory) -> Reason:

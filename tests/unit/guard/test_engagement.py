@@ -107,12 +107,6 @@ def test_a_switch_that_has_not_rested_is_told() -> None:
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=not_rested)
 
 
-def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
-    stepped = Stepped(engage_channel=9)
-    stepped.step()
-    assert stepped.step("engage") == FLIES
-
-
 def test_engage_on_arm_counts_the_first_arming_alone() -> None:
     stepped = Stepped(ON_GROUND, engage_on_arm=True)
     stepped.run(0.1)

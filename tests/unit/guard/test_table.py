@@ -36,6 +36,7 @@ KEPT = {"is_failsafe": True}
 """A failsafe that leaves the mode as it is: of ArduPilot, for example BATT_FS_LOW_ACT 0."""
 SIGNAL = EndRequest(because(Code.SIGNAL))
 SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
+UNDRIVEN, NO_CHANNELS = {"rc_channels_us": (1500,) * 6 + (0, 1500)}, {"rc_channels_us": ()}
 LANDS: dict[str, Any] = {"on_fault": "rtl", "then": "land"}
 OFFBOARD = altered(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 SETPOINTS: dict[str, Any] = {
@@ -201,6 +202,10 @@ CASES = {
     "act refused: the switch is low": Case(partial(waiting, altered(AIRBORNE, **SWITCH_LOW),
         engage_channel=7), {**ACT, "envelope_problem": TILT}, WAITING,
         refusal=Code.ENGAGE_SWITCH_OFF),
+    "the switch is not seen": Case(partial(waiting, altered(AIRBORNE, **UNDRIVEN),
+        engage_channel=7), {}, WAITING, why=Code.ENGAGE_SWITCH_UNSEEN),
+    "act refused: the switch is not seen": Case(partial(waiting, altered(AIRBORNE, **NO_CHANNELS),
+        engage_channel=7), ACT, WAITING, refusal=Code.ENGAGE_SWITCH_UNSEEN),
     "act refused after a takeover": Case(released, {**ACT, "chunk_problem": NO_IMAGE}, RELEASED,
         refusal=Code.NO_IMAGE),
     # PREPARING
@@ -322,6 +327,12 @@ CASES = {
             (Code.FAILSAFE, KEPT),
         )
     },
+    "switch not seen for 1 s": Case(lambda: after(partial(flying, **LANDS, engage_channel=7), 0.99,
+        **UNDRIVEN), {}, FLYING, POLICY),
+    "switch not seen for longer": Case(lambda: after(partial(flying, **LANDS, engage_channel=7),
+        1.0, **UNDRIVEN), {}, LEAVING, NEUTRAL, "RTL", Code.ENGAGE_SWITCH_UNSEEN),
+    "setpoints, switch not seen for longer": Case(lambda: after(in_offboard, 1.0, **NO_CHANNELS),
+        {}, LEAVING, NEUTRAL, "AUTO.LAND", Code.ENGAGE_SWITCH_UNSEEN),
     "a stale chunk alone": Case(flying, {"chunk_problem": NO_IMAGE}, FLYING, POLICY),
     # LEAVING and HOLDING
     "act while leaving": Case(leaving, ACT, LEAVING, NEUTRAL, refusal=Code.STILL_ENDING),
