@@ -298,6 +298,7 @@ _SPENT = {
     "guard": "the guard stood still for",
     "flight process": "the flight process stood still, or solved, for",
     "solve": "the solve took",
+    "lag": "the link delays attitudes by",
     "link": "the link delivered no {quantity} for",
     "camera": "the camera delivered nothing for",
 }

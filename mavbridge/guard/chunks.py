@@ -95,7 +95,7 @@ class Chunk(NamedTuple):
 
 
 _Input: TypeAlias = Literal["attitude", "velocity", "image", "chunk"]
-Place: TypeAlias = Literal["computer", "guard", "flight process", "solve", "link", "camera"]
+Place: TypeAlias = Literal["computer", "guard", "flight process", "solve", "lag", "link", "camera"]
 
 
 def late(
@@ -251,10 +251,8 @@ class ChunkBuffer:
     def problem(self, now_ns: int) -> Reason | None:
         """Return why no flight may begin now, or None if the chunk is fresh by all limits."""
         chunk = self.newest
-        if (flood := self._malformed_lately(now_ns)) is not None:
-            return flood
-        if (short := self._shortness()) is not None:
-            return short
+        if (defect := self._malformed_lately(now_ns) or self._shortness()) is not None:
+            return defect
         if chunk is None or now_ns > self._grace_until_ns:
             return self._refusal or because(Code.NO_CHUNK)
         if len(self._gaps_ns) < LEAST_GAPS:
@@ -271,9 +269,7 @@ class ChunkBuffer:
 
     def fault(self, now_ns: int) -> Reason | None:
         """Return why the flight must end now, or None: grace over, or malformed chunks."""
-        if (flood := self._malformed_lately(now_ns)) is not None:
-            return flood
-        return self.lateness(now_ns)
+        return self._malformed_lately(now_ns) or self.lateness(now_ns)
 
     def is_over(self, now_ns: int) -> bool:
         """True if the grace, or the allowed stall, has ended."""
@@ -285,6 +281,7 @@ class ChunkBuffer:
         *,
         stood_ns: int = 0,
         heard_ns: Mapping[str, int] | None = None,
+        lag_ns: int = 0,
         arriving: Chunk | None = None,
     ) -> Reason | None:
         """Return the reason with the input whose age ended the grace, or None during the grace.
@@ -293,12 +290,12 @@ class ChunkBuffer:
             now_ns: current time.
             stood_ns: duration of the guard's stall until now.
             heard_ns: arrival of the vehicle's newest "attitude" and "velocity", by these names.
+            lag_ns: time from measurement to arrival of the newest attitude.
             arriving: chunk that has just arrived.
         """
         if not self.is_over(now_ns):
             return None
-        said = None if self._is_stale else self._refusal
-        silent_ns = now_ns - self._word_ns
+        said, silent_ns = None if self._is_stale else self._refusal, now_ns - self._word_ns
         if self._seen is None:
             return late("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
         name: _Input | Literal["horizon"]
@@ -310,7 +307,8 @@ class ChunkBuffer:
             limit_ns = (self._end_ns if is_over else self._until_ns) - self._taken_ns
         spent: dict[Place, int] = {
             "flight process": silent_ns,
-            "solve": self._solve_ns,
+            "solve": self._solve_ns - lag_ns,
+            "lag": lag_ns,
             "link": now_ns - (heard_ns or {}).get(name, now_ns),
             "camera": self._word_ns - happened_ns if name == "image" else 0,
         }
@@ -320,6 +318,8 @@ class ChunkBuffer:
             was_solving = arriving is not None and arriving.computed_ns > now_ns - stood_ns // 2
             place = "guard" if was_solving else "computer"
             spent[place] = stood_ns
+        if said is not None and 4 * spent[place] < now_ns - happened_ns:
+            place = "flight process"  # which answers: nothing stood still
         return late(name, now_ns - happened_ns, limit_ns, place, spent[place], said)
 
     def _malformed_lately(self, now_ns: int) -> Reason | None:

@@ -557,6 +557,17 @@ def test_a_solve_that_took_too_long_is_named() -> None:
     assert held.fault(1104 * MS) == late("attitude", 164 * MS, 100 * MS, "solve", 150 * MS)
 
 
+def test_a_delay_of_the_link_is_no_long_solve_and_an_answer_blames_nothing() -> None:
+    held = holding(attitude_ns=903 * MS)
+    held.explain_absence(OLD_IMAGE, 1100 * MS)
+    told = held.lateness(1104 * MS, lag_ns=90 * MS)
+    assert figures(told, "place", "spent_ms") == ("lag", 90)
+    held = holding()
+    held.explain_absence(OLD_IMAGE, 1100 * MS)
+    told = held.lateness(1104 * MS, stood_ns=10 * MS, heard_ns={"attitude": 1099 * MS})
+    assert str(told) == f"{OLD_IMAGE}; attitude 109 ms old (limit 100 ms)"
+
+
 def test_what_the_flight_process_says_comes_first() -> None:
     held = holding()
     held.explain_absence(because(Code.POLICY_REFUSED, said="its server is gone"), 1050 * MS)

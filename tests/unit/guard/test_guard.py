@@ -320,6 +320,12 @@ def test_the_link_is_named_where_it_has_not_brought_one_reading_for_longest(
     assert output.tick.reason == late(name, 113 * MS, 50 * MS, "link", 130 * MS)  # type: ignore[arg-type]
 
 
+def test_a_link_that_delays_attitudes_is_named_for_it() -> None:
+    guard = Stepped().engaged()
+    guard.telemetry = Telemetry(rate_body_radps=Reading(START_NS, (0.0,) * 3, delay_ns=500 * MS))
+    assert spent(guard.step(161).tick.reason) == ("lag", 500)
+
+
 @pytest.mark.parametrize("readonly", [False, True])
 def test_sticks_that_were_not_sent_are_not_gone_on_from_but_where_none_are_sent(
     readonly: bool,
