@@ -164,7 +164,6 @@ class ImagineConfig(Ranged):
     """Write a video; without it only the rows are written."""
     fast_policy_no_decode: bool = False
     """Let the world model decide from its latents, without decoding and encoding them again."""
-    rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

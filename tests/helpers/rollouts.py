@@ -23,7 +23,7 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput
+from mavbridge.commands.imagine.output import SCHEMA, StreamedOutput
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
@@ -127,11 +127,10 @@ def run(
     decider: str = "world-model",
     decode_video: bool = True,
     model: TinyWorld | None = None,
-    on_frame: OnFrame | None = None,
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model)
-    output = StreamedOutput(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
+    output = StreamedOutput(out, sampler, plan, decode_video=decode_video)
     with closing(output):
         for segment in segments(sampler, plan, decider):
             output.put(segment)

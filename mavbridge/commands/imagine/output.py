@@ -11,7 +11,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from threading import Event
-from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -47,9 +46,6 @@ SCHEMA = pa.schema(
     ]
 )
 """Columns described in docs/formats.md, named after the attributes of ``RolloutFrame``."""
-
-OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
-"""Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""
 
 
 def prepare_out(out: Path) -> None:
@@ -93,20 +89,13 @@ class StreamedOutput:
     """
 
     def __init__(
-        self,
-        out: Path,
-        sampler: Sampler,
-        plan: RolloutPlan,
-        *,
-        decode_video: bool = True,
-        on_frame: OnFrame | None = None,
+        self, out: Path, sampler: Sampler, plan: RolloutPlan, *, decode_video: bool = True
     ) -> None:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
         self._model = sampler.model
         self._frame_dt_s = sampler.config.frame_dt_s
-        self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
         self._stream: torch.cuda.Stream | None = None
@@ -218,7 +207,6 @@ class StreamedOutput:
         for frame in frames:
             if self._stop.is_set():
                 return
-            rgb = None
             if self.video is not None:
                 rgb = segment.decoded.get(frame.frame)
                 if rgb is None:
@@ -228,8 +216,6 @@ class StreamedOutput:
                 row = FrameRow(frame_id=frame.number, captured_ns=at_ns, ready_ns=at_ns)
                 self.video.submit(rgb, row)
                 self._digest.update(np.ascontiguousarray(rgb).data)
-            if self._on_frame is not None:
-                self._on_frame(frame, rgb)
             self.frames += 1
 
     def _decoded(

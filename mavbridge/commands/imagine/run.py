@@ -1,10 +1,7 @@
 """``mavbridge imagine``: from a recorded flight and the settings to the files of a rollout."""
 
-from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +22,7 @@ from mavbridge.commands.imagine.loop import (
     rollout,
     torch_threads,
 )
-from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, prepare_out
+from mavbridge.commands.imagine.output import StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -76,17 +73,7 @@ def imagine(config: ImagineConfig) -> int:
     with ExitStack() as stack:
         decider = _make_decider(config, sampler, console, stack)
         stack.enter_context(torch_threads(free))
-        on_frame: OnFrame | None = None
-        if config.rerun != "off":
-            from mavbridge.observe.viewer.rollout import RolloutView
-
-            images = real_images(flight, model.config, start.newest_ns)
-            real = RealFrames(images, model.config.frames)
-            view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
-            on_frame = view.show
-        output = StreamedOutput(
-            config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
-        )
+        output = StreamedOutput(config.out, sampler, plan, decode_video=config.decode_video)
         stack.callback(output.close)
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
     _print_summary(config, output)
@@ -248,40 +235,3 @@ def _start_images(flight: RecordedFlight, frames: list[int], size: int) -> NDArr
 
 def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
     return int(np.abs(stamps_ns - at_ns).argmin())
-
-
-def real_images(
-    flight: RecordedFlight, config: WorldModelConfig, newest_ns: int
-) -> Iterator[ImageArray]:
-    """Yield the images of the flight's camera after the start, at the world model's times and
-    size."""
-    captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
-    images = enumerate(flight.rgb_images())
-    number, rgb = next(images)
-    for step in count(1):
-        at_ns = newest_ns + round(step * config.frame_dt_s * NS_PER_S)
-        if at_ns > captured_ns[-1]:
-            return
-        while number < _nearest(
-            captured_ns, at_ns
-        ):  # two steps may share an image of a slow camera
-            number, rgb = next(images)
-        yield resize(rgb, config.image_size, config.image_size)
-
-
-class RealFrames:
-    """The newest of ``real_images``, as many as one segment has, because segments overlap."""
-
-    def __init__(self, images: Iterator[ImageArray], frames: int) -> None:
-        self._images = images
-        self._newest_step = 0
-        self._window: deque[ImageArray] = deque(maxlen=frames)
-
-    def at(self, step: int) -> ImageArray | None:
-        """Return the frame of a step; None after the flight. Raise VideoError if it is damaged."""
-        while self._newest_step < step:
-            if (image := next(self._images, None)) is None:
-                return None
-            self._window.append(image)
-            self._newest_step += 1
-        return self._window[step - self._newest_step - 1]

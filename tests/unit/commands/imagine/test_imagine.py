@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from rerun.chunk import RrdReader
 
 from helpers.recordings import count_frames
 from helpers.rollouts import TinyWorld, read_rows, write_flight
@@ -63,22 +62,6 @@ def test_without_a_video_there_are_rows_and_nothing_is_decoded(
     assert "32 rows, no video" in text
     assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
     assert read_rows(tmp_path / "a.mp4").num_rows == 32
-
-
-def test_rerun_shows_imagined_and_real_frames_states_and_sticks(
-    imagine: Imagine, tmp_path: Path
-) -> None:
-    rrd = tmp_path / "a.rrd"
-    flags = ("--n-iter", "3", "--frames", "6", "--exe-steps", "6", "--rerun", str(rrd))
-    status, text = imagine(*flags)
-    assert status == 0, text
-    shown: dict[str, int] = {}
-    for chunk in RrdReader(rrd).stream():
-        if not chunk.is_static and not chunk.entity_path.startswith("/__"):
-            rows = chunk.to_record_batch().num_rows
-            shown[chunk.entity_path] = shown.get(chunk.entity_path, 0) + rows
-    states = ("/state/velocity", "/state/attitude", "/state/rate", "/state/force")
-    assert shown == dict.fromkeys(("/imagined", "/real", "/sticks", *states), 18)
 
 
 def test_ctrl_c_finishes_what_is_there(

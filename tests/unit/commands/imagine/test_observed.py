@@ -22,11 +22,13 @@ from helpers.rollouts import (
 )
 from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider, rollout
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS
-from mavbridge.commands.imagine.run import RealFrames, read_start, real_images
+from mavbridge.commands.imagine.run import read_start
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
+from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import Contract
 
 
@@ -45,17 +47,6 @@ def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight:
     at_ns, sticks = start.sent[-1]
     assert START_NS + 490 * NS_PER_MS <= at_ns < start.newest_ns
     assert sticks.yaw == pytest.approx(0.049)
-
-
-def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Path) -> None:
-    opened = open_flight(flight)
-    images = real_images(opened, TINY, read_start(opened, TINY, 0.0).newest_ns)
-    real = RealFrames(images, TINY.frames)
-    for step in (1, 2, 3, 4, 2, 3, 4, 5):  # segments overlap
-        rgb = real.at(step)
-        assert rgb.mean() == pytest.approx(grey(3 + 3 * step), abs=3)
-    assert real.at(8) is not None
-    assert real.at(9) is None
 
 
 def test_a_flight_without_states_frames_or_known_axes_is_refused(tmp_path: Path) -> None:
@@ -148,15 +139,22 @@ def test_the_history_is_in_seconds_before_and_after_the_start() -> None:
     np.testing.assert_allclose(throttle[2], [0.1, 0.1, 0.2, 0.2], rtol=1e-6)
 
 
-def test_no_frame_is_held_for_longer_than_a_queue_is_long(tmp_path: Path) -> None:
-    frames, seen, held = 4, list[weakref.ref[object]](), list[int]()
+def test_no_frame_is_held_for_longer_than_a_queue_is_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, seen, held, submit = 4, list[weakref.ref[object]](), list[int](), VideoWriter.submit
 
-    def on_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
-        seen.extend((weakref.ref(rgb), weakref.ref(frame.state)))
+    def watched(video: VideoWriter, rgb: ImageArray, row: FrameRow) -> None:
+        seen.append(weakref.ref(rgb))
         held.append(sum(one() is not None for one in seen))
+        submit(video, rgb, row)
 
-    plan = make_plan(iterations=96, frames=frames, exe_steps=2)
-    run(tmp_path / "a.mp4", plan, decider="toge", on_frame=on_frame)
-    assert len(seen) == 2 * 96 * frames
+    monkeypatch.setattr(VideoWriter, "submit", watched)
+    run(
+        tmp_path / "a.mp4",
+        make_plan(iterations=96, frames=frames, exe_steps=2),
+        decider="toge",
+    )
+    assert len(seen) == 96 * frames
     # A segment in hand, and what the loop observes.
-    assert max(held) <= 2 * (frames + QUEUED_SEGMENTS * frames) + 2
+    assert max(held) <= frames + QUEUED_SEGMENTS * frames + 2
