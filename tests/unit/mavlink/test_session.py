@@ -376,6 +376,26 @@ def test_a_clock_that_steps_is_not_trusted_until_exchanges_agree_again() -> None
         assert sync.is_good == (k == GOOD_EXCHANGES - 1)
 
 
+def test_an_answer_that_is_dated_back_does_not_move_the_offset_and_a_step_back_does() -> None:
+    """ArduPilot's, by bytes that wait at a slow port. Its stamps tell that it is no step."""
+    sync = good_timesync()
+
+    def stamped(at_ns: int) -> int:
+        return sync.happened_ns(boot_us(at_ns), at_ns + 2 * NS_PER_MS)
+
+    for k in range(100):
+        at_ns = 10 * S + k * S // 5
+        assert stamped(at_ns - 10 * NS_PER_MS) == at_ns - 10 * NS_PER_MS
+        dated_ns = BOOT_NS - 29 * NS_PER_MS
+        exchange(sync, at_ns, up_ns=4 * NS_PER_MS, down_ns=4 * NS_PER_MS, offset_ns=dated_ns)
+        assert (sync.offset_ns, sync.is_good) == (BOOT_NS, True)
+    stepped_ns = BOOT_NS - S
+    for k in range(2):  # stamps before the step hide it from the first exchange
+        exchange(sync, 40 * S + k * S // 5, up_ns=1, down_ns=1, offset_ns=stepped_ns)
+        sync.happened_ns(boot_us(39 * S), 40 * S + k * S // 5)
+    assert sync.offset_ns == stepped_ns
+
+
 def test_a_clock_that_wavers_by_a_few_milliseconds_is_trusted() -> None:
     """The simulator's, against the wall clock; answers take almost no time."""
     sync = good_timesync()
