@@ -113,13 +113,14 @@ class ArduPilot(Profile):
         """
         attitude = ("ATTITUDE_QUATERNION", "ATTITUDE")
         imu = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
+        late = "a takeover whose packet is lost, and a disarming, are seen up to 1 s late"
         return (
             StreamGroup(attitude, state_hz, True, dialect.MAV_DATA_STREAM_EXTRA1),
             StreamGroup(("LOCAL_POSITION_NED",), state_hz, True, dialect.MAV_DATA_STREAM_POSITION),
             StreamGroup(imu, state_hz, True, dialect.MAV_DATA_STREAM_RAW_SENSORS),
             self.stick_echo._replace(rate_hz=pilot_hz or RC_CHANNELS_HZ),
             *condition_streams("EKF_STATUS_REPORT"),
-            StreamGroup(("HEARTBEAT",), HEARTBEAT_HZ),
+            StreamGroup(("HEARTBEAT",), HEARTBEAT_HZ, without=late),
         )
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:

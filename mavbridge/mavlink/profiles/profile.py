@@ -59,7 +59,7 @@ class StreamGroup(NamedTuple):
     """Rate of a message that is sent only on change, at or below which it is requested again; 0: if
     it stays away. None: the message is periodic, and a fraction of ``rate_hz`` decides."""
     without: str = ""
-    """Effect of its absence, for the user; told once."""
+    """Effect of its absence or rareness, for the user; told once."""
     stand_in: str | None = None
     """Message to request one at a time during its absence."""
 

@@ -17,6 +17,9 @@ _WATCH_NS = 2 * NS_PER_S
 _UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
 _ENOUGH = 0.7
 """Fraction of the granted rate below which another station is assumed to have changed it."""
+_RARE = 0.125
+"""Fraction of the granted rate at or below which a message is as good as absent: HEARTBEAT at 1 Hz
+in place of 10."""
 _ALIKE = 0.2
 """Relative spread of the streams' rate fractions below which they have one cause."""
 _AWAY_NS = 250 * NS_PER_MS
@@ -217,10 +220,13 @@ class StreamRequester:
             self._tell(share)
             return
         for stream in self._streams:
-            is_absent = stream.group.without and not stream.received and share is None
-            if is_absent and not stream.is_absence_told:
+            group, rate_hz = stream.group, stream.arriving_hz(span_s)
+            is_rare = stream.is_settled and rate_hz <= _RARE * stream.rate_hz
+            is_lacking = not stream.received or (is_rare and group.least_hz is None)
+            if group.without and is_lacking and share is None and not stream.is_absence_told:
                 stream.is_absence_told = True
-                self._report(f"{stream.group.messages[0]} does not come: {stream.group.without}")
+                comes = f"comes at {rate_hz:.1g} Hz" if stream.received else "does not come"
+                self._report(f"{group.messages[0]} {comes}: {group.without}")
             if stream.is_slow(span_s):
                 stream.is_settled = False
                 self.renewals += stream.group.is_needed

@@ -227,6 +227,16 @@ def test_what_stays_away_is_told_once_and_stood_in_for_while_it_does() -> None:
     assert link.stand_ins - before <= 20 * 0.3
 
 
+@pytest.mark.parametrize(("beats_hz", "texts"), [(1.0, 1), (5.0, 0)])
+def test_rare_heartbeats_are_told_once(beats_hz: float, texts: int) -> None:
+    link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
+    link.run(0.5)  # until all are granted
+    for _ in range(100):
+        link.rates_hz[IDS["HEARTBEAT"]] = beats_hz  # whatever was granted
+        link.run(0.1)
+    assert [text.partition(":")[0] for text in link.texts] == ["HEARTBEAT comes at 1 Hz"] * texts
+
+
 @pytest.mark.parametrize(
     ("state_hz", "attitude_hz", "position_hz"),
     [(50, 50, 50), (100, 100, 100), (125, 125, 125), (200, 250, 125), (400, 250, 125)],
