@@ -20,6 +20,7 @@ from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
@@ -125,6 +126,7 @@ class GuardFlight:
         self.guard = GuardLoop(self.clock, self.link, self.guard_port)
         self.features = FreshFeatures(self.clock)
         self.sink = ListSink()
+        self.solves: list[Solve] = []
         runner = self._runner(contract)
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
@@ -136,6 +138,7 @@ class GuardFlight:
             send=self._send,
             cameras=[CameraPath(camera=NoCamera(), cache=self.features, clock=self.clock)],
             sinks=[self.sink],
+            watch_solve=self.solves.append,
             watches_images=False,
         )
         self.view = bridge.view

@@ -58,6 +58,8 @@ class Network(MemoryTransport):
         self.address: Address = VEHICLE
         """Address that the vehicle sends from."""
         self.strangers: deque[Received] = deque()
+        self.received: list[Received] = []
+        """Everything from the vehicle, as a recording holds it."""
         self.is_down = False
         """True if the port is gone."""
 
@@ -79,6 +81,7 @@ class Network(MemoryTransport):
     def drain(self) -> Iterator[Received]:
         self.open()
         for received in super().drain():
+            self.received.append(received)
             yield received._replace(sender=self.address)
         while self.strangers:
             yield self.strangers.popleft()

@@ -10,16 +10,24 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
+from helpers.output_flights import OutputFlight
 from helpers.recordings import make_meta
-from mavbridge.config.flight import FlyConfig
+from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
-from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.core.vehicle import ActionKind, ForwardedPacket
+from mavbridge.guard.values import Phase
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation import flight as simulation
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.replay.compare import PAST_INPUTS, PolicyComparison, compare_policy
+from mavbridge.simulation.replay.compare import (
+    PAST_INPUTS,
+    PolicyComparison,
+    compare_guard,
+    compare_policy,
+)
+from mavbridge.simulation.replay.guard import replay_guard
 from mavbridge.simulation.replay.policy import replay_policy
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from mavbridge.simulation.world import make_vehicle
@@ -206,3 +214,37 @@ def test_every_kind_of_action_is_repeated_bit_for_bit(
 ) -> None:
     compared = flown_and_repeated(monkeypatch, attentive(**changes), autopilot=autopilot)
     assert_equal(compared)
+
+
+def hold_and_quit(flight: OutputFlight) -> None:
+    flight.act("release")
+    flight.until(lambda: flight.phase is Phase.HOLDING, within_s=8)
+    flight.act("release")
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "action", "end"),
+    [("px4", "sticks", hold_and_quit)],
+)
+def test_the_guard_is_repeated_to_the_end_of_a_flight(
+    autopilot: AutopilotName, action: ActionKind, end: Callable[[OutputFlight], None]
+) -> None:
+    flight = OutputFlight(autopilot, action)
+    flight.fly(0.2)
+    end(flight)
+    flight.run(0.5)
+    requests = [m for _, m in flight.left() if m.get_type() == "PARAM_REQUEST_READ"]
+    source = ReplaySource(
+        folder=Path("in memory"),
+        meta=make_meta(contract=flight.scripted.contract, autopilot=autopilot),
+        contract=flight.scripted.contract,
+        config=FlyConfig(link=LinkConfig(connect="memory")),
+        ticks=tuple(flight.sink.ticks),
+        solves=tuple(flight.solves),
+        features=((),),
+        packets=tuple(RecordedPacket(r.arrived_ns, None, r.data) for r in flight.network.received),
+        known_params=frozenset(m.param_id for m in requests),
+        gaps=(),
+    )
+    assert source.ticks[-1].phase != "flying"
+    assert compare_guard(replay_guard(source)).differ == {}

@@ -175,6 +175,7 @@ def _act(before: Tick | None, tick: Tick, *, is_arm: bool) -> OperatorCommand | 
     if is_called_off and was == tick.phase == "waiting":
         return "release"  # `--arm` waits for the link alone
     is_ended = was in ("preparing", "flying") and tick.phase != was
+    is_ended |= (was, tick.phase) == ("holding", "leaving")
     if is_ended and tick.release_reason and tick.release_reason.code is Code.OPERATOR:
         return "release"
     return None
