@@ -222,9 +222,26 @@ def hold_and_quit(flight: OutputFlight) -> None:
     flight.act("release")
 
 
+def lose_camera(flight: OutputFlight) -> None:
+    last = flight.features.latest()
+    flight.features.latest = lambda: last  # type: ignore[method-assign]
+
+
+def have_no_chunk(flight: OutputFlight) -> None:
+    def refuse(*_: object) -> None:
+        raise NoChunkError("not now")
+
+    flight.scripted.predict_fast = refuse  # type: ignore[assignment]
+
+
 @pytest.mark.parametrize(
     ("autopilot", "action", "end"),
-    [("px4", "sticks", hold_and_quit)],
+    [
+        ("px4", "sticks", hold_and_quit),
+        ("px4", "sticks", OutputFlight.return_nan),
+        ("ardupilot", "velocity", lose_camera),
+        ("ardupilot", "velocity", have_no_chunk),
+    ],
 )
 def test_the_guard_is_repeated_to_the_end_of_a_flight(
     autopilot: AutopilotName, action: ActionKind, end: Callable[[OutputFlight], None]

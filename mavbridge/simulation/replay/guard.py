@@ -3,12 +3,14 @@
 ``GuardLoop`` and ``MavlinkLink`` run as in the flight; the socket, the channel to the flight
 process and the clock are replaced. The recording supplies the times at which the guard woke,
 decided and had sent its sticks, the received bytes, and the newest chunk at each pass. Requests of
-the operator or the flight process are derived from the phases.
+the operator or the flight process are derived from the phases, refused or absent chunks from the
+reason for the end.
 """
 
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
@@ -19,12 +21,12 @@ from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.settings import link_settings
-from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.chunks import GRACE_PERIODS, LEAST_GRACE_NS, MAX_REFUSED, Chunk
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
-from mavbridge.guard.wire import GuardTick, decode_from_guard, encode_to_guard
+from mavbridge.guard.wire import GuardTick, ToGuard, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
@@ -54,6 +56,8 @@ class GuardStep:
     """Chunk that the guard got in this pass."""
     act: OperatorCommand | None
     stop: EndRequest | None
+    told: tuple[tuple[int, Reason], ...]
+    """When and why the guard was told, since the step before, that there is no usable chunk."""
 
 
 def recorded_plan(source: ReplaySource) -> FlightPlan:
@@ -76,12 +80,25 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
+    absences = deque(_absences(source, settings.chunk_period_ns))
     for tick, chunk, act, stop in _arrivals(source):
+        at_ns, told = tick.decided_ns or tick.woke_ns, []
+        absence: Reason | None = None
+        while absences and absences[0][0] <= at_ns:
+            told_ns, absence = absences.popleft()
+            if told_ns < at_ns:
+                _keep_link(link, clock, transport, min(told_ns, tick.woke_ns, tick.due_ns - 1))
+                told_ns = clock.now_ns()
+            told.append((told_ns, absence))
+            if told_ns < tick.due_ns:  # else in the pass of the tick
+                port.inbox.append(encode_to_guard(absence))
+                loop.step()
+                absence = None
         _keep_link(link, clock, transport, tick.woke_ns)
-        port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
+        port.decided_ns, transport.sent_ns = at_ns, tick.sent_ns
         is_neutral_refused = source.meta.keeps_neutral and tick.lacks_neutral
         transport.is_refusing = tick.is_refused or is_neutral_refused
-        messages: tuple[Chunk | OperatorCommand | EndRequest | None, ...] = (chunk, act, stop)
+        messages: tuple[ToGuard | None, ...] = (chunk, absence, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
         steps.append(
@@ -92,6 +109,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
                 chunk_serial=chunk.serial if chunk else None,
                 act=act,
                 stop=stop,
+                told=tuple(told),
             )
         )
     return steps
@@ -133,9 +151,17 @@ def replay_other(
     for step in steps:
         chunk = None if step.chunk_serial is None else chunks.get(step.chunk_serial)
         at_ns = step.recorded.decided_ns or step.recorded.woke_ns
+        absence: Reason | None = None
+        for told_ns, reason in step.told:
+            if told_ns < step.recorded.due_ns:
+                guard.step(told_ns, GuardInput(link=step.snapshot, absence=reason))
+            else:
+                absence = reason
         yield guard.step(
             at_ns,
-            GuardInput(link=step.snapshot, chunk=chunk, act=step.act, stop=step.stop),
+            GuardInput(
+                link=step.snapshot, chunk=chunk, absence=absence, act=step.act, stop=step.stop
+            ),
         )
 
 
@@ -157,6 +183,31 @@ def _arrivals(
         chunk = None if newest is None else chunk_of(newest, frame)
         yield tick, chunk, _act(before, tick, is_arm=source.config.arm), _stop(before, tick)
         before = tick
+
+
+def _absences(source: ReplaySource, period_ns: int) -> Iterator[tuple[int, Reason]]:
+    """Yield when and why the guard was told that there is no usable chunk.
+
+    Such a pass has no tick, but the reason for the end tells of it: the last malformed chunks come
+    with the tick that ends the flight, another absence when it ends the grace at that tick.
+    """
+    shortening_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns) - period_ns
+    taken_ns = serial = 0
+    for before, tick in pairwise(source.ticks):
+        if before.chunk_serial is not None and before.chunk_serial != serial:
+            taken_ns, serial = before.decided_ns or before.woke_ns, before.chunk_serial
+        reason, at_ns = tick.release_reason, tick.decided_ns or tick.woke_ns
+        if before.phase != "flying" or tick.phase == "flying" or reason is None:
+            continue
+        data = dict(reason.data)
+        why, said = data.get("why"), data.get("said")
+        if reason.code is Code.UNUSABLE_CHUNKS and isinstance(why, Reason):
+            yield from ((at_ns - left, why) for left in reversed(range(MAX_REFUSED)))
+        elif reason.code in (Code.LATE, Code.PAST_HORIZON):
+            if any(serial < each.serial and each.computed_ns < at_ns for each in source.solves):
+                said = said or because(Code.NO_CHUNK)  # they were too old
+            if isinstance(said, Reason):
+                yield max(taken_ns + 1, at_ns - 1 - shortening_ns), said
 
 
 def _is_seen(solve: Solve, tick: Tick, after: Tick | None) -> bool:
