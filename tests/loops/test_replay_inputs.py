@@ -234,6 +234,13 @@ def have_no_chunk(flight: OutputFlight) -> None:
     flight.scripted.predict_fast = refuse  # type: ignore[assignment]
 
 
+def lose_connection(flight: OutputFlight) -> None:
+    flight.network.is_down = True
+    flight.run(0.3)
+    flight.network.is_down = False
+    flight.run(0.8)
+
+
 @pytest.mark.parametrize(
     ("autopilot", "action", "end"),
     [
@@ -241,6 +248,7 @@ def have_no_chunk(flight: OutputFlight) -> None:
         ("px4", "sticks", OutputFlight.return_nan),
         ("ardupilot", "velocity", lose_camera),
         ("ardupilot", "velocity", have_no_chunk),
+        ("ardupilot", "velocity", lose_connection),
     ],
 )
 def test_the_guard_is_repeated_to_the_end_of_a_flight(

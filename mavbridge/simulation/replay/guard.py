@@ -28,7 +28,13 @@ from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, ToGuard, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.connection import Address, Received, Transport
+from mavbridge.mavlink.transport.connection import (
+    REOPEN_NS,
+    Address,
+    Received,
+    Transport,
+    TransportDownError,
+)
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
@@ -79,7 +85,8 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     port.inbox.append(encode_to_guard(settings))
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
-    steps = []
+    steps: list[GuardStep] = []
+    codes: tuple[Code, ...] = ()
     absences = deque(_absences(source, settings.chunk_period_ns))
     for tick, chunk, act, stop in _arrivals(source):
         at_ns, told = tick.decided_ns or tick.woke_ns, []
@@ -98,6 +105,8 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
         port.decided_ns, transport.sent_ns = at_ns, tick.sent_ns
         is_neutral_refused = source.meta.keeps_neutral and tick.lacks_neutral
         transport.is_refusing = tick.is_refused or is_neutral_refused
+        before, codes = codes, tick.release_reason.codes if tick.release_reason else ()
+        transport.is_lost = Code.CONNECTION_LOST in codes and Code.CONNECTION_LOST not in before
         messages: tuple[ToGuard | None, ...] = (chunk, absence, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
@@ -282,11 +291,21 @@ class _RecordedTransport(Transport):
         """Time at which the sticks of this pass had left."""
         self.is_refusing = False
         """True if the last recorded action was refused."""
+        self.is_lost = False
+        """True if the next read loses the connection."""
+        self._is_down = False
+
+    def open(self) -> None:
+        """Fail after a loss unless a packet follows before the next attempt."""
+        limit_ns = self._clock.now_ns() + REOPEN_NS
+        if self._is_down and (self._next is None or self._next.arrived_ns >= limit_ns):
+            raise TransportDownError("as in the recording")
+        self._is_down = False
 
     @property
     def next_arrival_ns(self) -> int | None:
-        """Arrival of the next packet; None after the last."""
-        return None if self._next is None else self._next.arrived_ns
+        """Arrival of the next packet; None after the last, and without a connection."""
+        return None if self._next is None or self._is_down else self._next.arrived_ns
 
     def drain(self) -> Iterator[Received]:
         """Yield every packet that has arrived."""
@@ -294,6 +313,9 @@ class _RecordedTransport(Transport):
         while self._next is not None and self._next.arrived_ns <= now_ns:
             packet, self._next = self._next, next(self._packets, None)
             yield Received(packet.data, packet.arrived_ns, VEHICLE)
+        if self.is_lost:
+            self.is_lost, self._is_down = False, True
+            raise TransportDownError("as in the recording")
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Advance the clock to the recorded end of sending; refuse what was refused then."""
