@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from helpers.output_flights import COMBINATIONS, OutputFlight
+from helpers.output_flights import COMBINATIONS, HOVERING, OutputFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
@@ -168,6 +168,28 @@ def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     assert flight.px4.mode_name == ("AUTO.LOITER" if is_dead else "AUTO.LAND")
 
 
+def fall_back(flight: OutputFlight, *receiver_us: int) -> None:
+    """Let PX4 follow this receiver whenever we send no sticks."""
+    axes = enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)
+    for name, value in {"COM_RC_IN_MODE": 6, **{f"RC_MAP_{axis}": k for k, axis in axes}}.items():
+        assert flight.vehicle.params.set(name, value)
+    flight.vehicle.set_receiver(receiver_us)
+
+
+@pytest.mark.parametrize("end", [OutputFlight.die, OutputFlight.kill_guard])
+def test_arm_looks_at_the_pilots_sticks_before_ours_hide_them(
+    end: Callable[[OutputFlight], None],
+) -> None:
+    flight = OutputFlight("px4", "sticks", HOVERING, in_air=False, arm=True)
+    fall_back(flight, 1500, 1500, 1500, 1500)
+    flight.until(lambda: flight.px4.armed and not flight.px4.landed, within_s=10)
+    flight.run(0.5)  # it reports its takeoff
+    end(flight)
+    flight.run(1.5)
+    assert flight.px4.mode_name == "ALTCTL", flight.describe()
+    assert flight.px4.stick_input.source == RC_SOURCE
+
+
 @pytest.mark.parametrize(
     ("end", "throttle_us", "mode"),
     [
@@ -189,11 +211,8 @@ def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_th
     said: list[str] = []
     monkeypatch.setattr(MavlinkLink, "announce", lambda link, text: said.append(text))
     flight = OutputFlight("px4", "sticks", engage_channel=5)
-    mapped = {f"RC_MAP_{axis}": k for k, axis in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)}
-    for name, value in {"COM_RC_IN_MODE": 6, **mapped}.items():
-        assert flight.vehicle.params.set(name, value)
     sticks_us = (1500, 1500, throttle_us, 1500)
-    flight.vehicle.set_receiver((*sticks_us, 1000))
+    fall_back(flight, *sticks_us, 1000)
     flight.launch().run(0.3)
     flight.vehicle.set_receiver((*sticks_us, 2000))
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=1.0)

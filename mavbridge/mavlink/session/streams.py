@@ -158,6 +158,11 @@ class StreamRequester:
             stream.received[name] += 1
             stream.newest_ns = arrived_ns
 
+    def has_come(self, name: str) -> bool:
+        """True if this message has come since it was wanted."""
+        stream = self._by_message.get(name)
+        return stream is not None and stream.newest_ns > 0
+
     def receive_ack(self, ack: CommandAck) -> None:
         """Process the vehicle's answer to the open request."""
         if self._pending is None or ack.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:

@@ -34,7 +34,7 @@ from mavbridge.mavlink.codec.messages import (
     later_by_us,
 )
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile
+from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile, StreamGroup
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.condition import SETTLE_NS, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
@@ -156,6 +156,10 @@ class VehicleSession:
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
+        self._echo: StreamGroup | None = None
+        """Echo of the output; None until it is chosen."""
+        self._pilot_due_ns: int | None = None
+        """Deadline for the pilot's sticks to be shown; None until everything else is ready."""
         self.params = VehicleParams(
             self.profile, config, streams=streams, old_params=old_params, report=report
         )
@@ -174,7 +178,8 @@ class VehicleSession:
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: request its echo, check its demands."""
         self.params.use_output(output)
-        self._streams.add(self.profile.echo(output))
+        self._echo = self.profile.echo(output)
+        self._streams.add(self._echo)
 
     def watch_home_height(self) -> None:
         """Request the height above home, often enough to fly by."""
@@ -291,7 +296,24 @@ class VehicleSession:
 
     def output_problem(self, now_ns: int) -> Reason | None:
         """Return why the vehicle cannot be flown now with the chosen output, or None."""
-        return self.params.output_problem(self.status(now_ns)) or self.switch_problem
+        problem = self.params.output_problem(self.status(now_ns)) or self.switch_problem
+        if problem is None and self._is_pilot_awaited(now_ns):
+            return because(Code.LOOKING_FOR_RECEIVER)
+        return problem
+
+    def _is_pilot_awaited(self, now_ns: int) -> bool:
+        """True until the vehicle has shown the sticks that it would get back, or 2 s have passed.
+
+        Ours hide them from the first packet on.
+        """
+        echo, falls_back = self.profile.stick_echo, self.params.traits.falls_back
+        if self._echo is not echo or not falls_back or not self.condition.has_receiver:
+            return False
+        if self._streams.has_come(echo.messages[0]):
+            return False
+        if self._pilot_due_ns is None:
+            self._pilot_due_ns = now_ns + RECEIVER_WAIT_NS
+        return now_ns < self._pilot_due_ns
 
     @property
     def switch_problem(self) -> Reason | None:
