@@ -176,6 +176,8 @@ class FlightOutcome:
     """Mode, arming and landing: last report of the vehicle in this run."""
     is_armed: bool
     is_landed: bool | None
+    is_current: bool = True
+    """False: the guard was gone, so that the vehicle's last report may be out of date."""
     gates_total: int | None
     """None: no course was named."""
     gates_passed: int | None

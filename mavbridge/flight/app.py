@@ -201,7 +201,8 @@ class _Flight:
             end = summary.outcome.end or end
         elif referee.reason not in (None, asked.reason):  # the guard died after the flight
             end = referee.end
-        return referee.outcome(end, self._bridge.view.status, asked.reason)
+        status, is_current = self._bridge.view.status, summary is not None
+        return referee.outcome(end, status, asked.reason, is_current=is_current)
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
         config = self._config.camera

@@ -132,11 +132,17 @@ class FlightReferee:
         return EndRequest(reason=because(Code.COURSE_DONE), end="course") if is_over else None
 
     def outcome(
-        self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
+        self,
+        end: FlightEnd,
+        vehicle: GuardStatus,
+        asked: Reason | None = None,
+        *,
+        is_current: bool = True,
     ) -> FlightOutcome | None:
         """Return the outcome of a flight that ended by ``end``; None if the policy has not flown.
 
-        ``asked``: reason for the end, if the guard died before it could tell one.
+        ``asked``: reason for the end, if the guard died before it could tell one;
+        ``is_current``: the guard has reported ``vehicle`` until its own end.
         """
         if (flown := self._flown) is None:
             return None
@@ -151,6 +157,7 @@ class FlightReferee:
             mode=vehicle.mode,
             is_armed=vehicle.armed,
             is_landed=vehicle.is_landed,
+            is_current=is_current,
             gates_total=self._gates_total,
             gates_passed=len(passed_ns) if knows_gates else None,
             course_s=(passed_ns[-1] - self._began_ns) / NS_PER_S if passed_ns else None,
@@ -180,7 +187,8 @@ def describe(outcome: FlightOutcome) -> str:
     if outcome.speed_mps is not None:
         left.append(f"{outcome.speed_mps:.1f} m/s")
     state = "landed" if outcome.is_landed else "armed" if outcome.is_armed else "disarmed"
-    left.append(f"now {state} in {outcome.mode or 'an unknown mode'}")
+    seen = "now" if outcome.is_current else "last seen"
+    left.append(f"{seen} {state} in {outcome.mode or 'an unknown mode'}")
     text = "; ".join(", ".join(part) for part in (course, left) if part)
     is_told = outcome.end in _UNPLANNED and outcome.reason is not None
     return f"{text}: {outcome.reason}" if is_told else text

@@ -91,6 +91,8 @@ def _wrong(verdict: Verdict, report: VehicleReport, sent: list[Sent]) -> Iterato
         yield "it prints a traceback"
     if verdict.exit == ExitCode.FAULT and "ended by a signal" in verdict.output:
         yield "it ended by a fault, and blames a signal"
+    if "the guard process has died" in verdict.output and ", now armed in" in verdict.output:
+        yield "it claims to know the mode without a guard"
     if report["refused_messages"]:
         yield f"the vehicle refused {report['refused_messages']} messages"
     if wild := [row.message for row in sent if not row.is_within_limits]:

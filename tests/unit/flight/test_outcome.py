@@ -199,10 +199,11 @@ def test_a_second_flight_has_a_reason_of_its_own() -> None:
         for tick in ticks:
             referee.emit(tick)
         assert referee.end == end
-    outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED))
+    outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED), is_current=False)
     assert outcome is not None
     assert outcome.reason == because(Code.GUARD_DIED)
-    assert "now armed in an unknown mode: " in describe(replace(outcome, mode=None))  # rebooted
+    assert describe(outcome).endswith("last seen armed in LOITER: the guard has died")
+    assert "last seen armed in an unknown mode: " in describe(replace(outcome, mode=None))
 
 
 @pytest.mark.parametrize(
