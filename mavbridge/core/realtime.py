@@ -47,7 +47,7 @@ def settle_process() -> None:
 def prepare_to_die_first() -> None:
     """Let the kernel kill this process before the guard, and without a core dump.
 
-    The guard learns of the death when the kernel closes the channel, which is after any dump.
+    The guard learns of the death when the process begins to exit, which is after any dump.
     Children inherit both settings, so start the guard before. Settings that the system refuses stay
     unchanged.
     """

@@ -4,6 +4,7 @@ It prints nothing, since a reader of its output might block it. Messages and err
 channel (the first file descriptor), the vehicle's readings through the second.
 """
 
+import os
 import select
 import signal
 import socket
@@ -44,7 +45,9 @@ def main() -> None:
     """Serve one flight process until control has been given back."""
     for name in _SURVIVED:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
-    port, samples = (SocketPort(socket.socket(fileno=int(fd))) for fd in sys.argv[1:])
+    port, samples = (
+        SocketPort(socket.socket(fileno=int(fd)), peer_pid=os.getppid()) for fd in sys.argv[1:]
+    )
     select.select([port], [], [], SETTINGS_TIMEOUT_S)
     first, *later = port.receive() or [b""]
     settings = decode_to_guard(first) if first else None

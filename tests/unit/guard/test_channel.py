@@ -1,3 +1,6 @@
+import os
+import platform
+import subprocess
 import threading
 
 import pytest
@@ -47,6 +50,23 @@ def test_the_end_of_the_other_side_is_noticed_after_its_last_message(unread: int
     assert list(other.receive())[-1:] in ([b"the last"], [])
     assert other.is_closed
     assert not other.send(b"too late")
+    other.close()
+
+
+@pytest.mark.skipif(platform.system() != "Linux", reason="flags in /proc are Linux's")
+def test_the_death_of_the_other_process_is_noticed_before_its_socket_closes() -> None:
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as process:
+        end, other_end = channel_pair()
+        one, other = SocketPort(end), SocketPort(other_end, peer_pid=process.pid)
+        one.send(b"before")
+        assert other.receive() == [b"before"]
+        assert not other.is_closed
+        one.send(b"the last")
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert other.receive() == [b"the last"]
+        assert other.is_closed
+    one.close()
     other.close()
 
 
