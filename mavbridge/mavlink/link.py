@@ -318,7 +318,7 @@ class MavlinkLink:
             return
         place, timeout_s = self._config.connect, self._config.connect_timeout_s
         waited_s = (now_ns - self._started_ns) / NS_PER_S
-        if waited_s > timeout_s and not self._discovery.is_settling:
+        if waited_s > timeout_s and not self._discovery.is_settling(now_ns):
             address = parse_address(place)
             why = self._discovery.describe(address, waited_s, self._connection, now_ns)
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")

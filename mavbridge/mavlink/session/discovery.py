@@ -60,9 +60,9 @@ class VehicleDiscovery:
         """Last heartbeat of each vehicle, the oldest first."""
         self._begun_ns: dict[VehicleIdentity, int] = {}
         """First heartbeat of each vehicle."""
-        self._others: set[str] = set()
-        self._odd_components: set[int] = set()
-        """Components other than 1 that claim to be an autopilot."""
+        self._others: dict[str, Endpoint] = {}
+        self._odd_ids: set[Endpoint] = set()
+        """Autopilots with another component than 1, or with system 0."""
         self._first_ns: int | None = None
 
     def receive(
@@ -70,18 +70,18 @@ class VehicleDiscovery:
     ) -> None:
         """Note a heartbeat from any sender."""
         is_vehicle = (
-            source.system != 0
-            and heartbeat.vehicle_type not in _NOT_VEHICLES
+            heartbeat.vehicle_type not in _NOT_VEHICLES
             and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
         )
         if not is_vehicle:
             kind = dialect.enums["MAV_TYPE"].get(heartbeat.vehicle_type)
             name = kind.name.removeprefix("MAV_TYPE_") if kind else str(heartbeat.vehicle_type)
             if len(self._others) < _CAPACITY:
-                self._others.add(f"{name} (system {source.system}, component {source.component})")
+                named = f"{name} (system {source.system}, component {source.component})"
+                self._others[named] = source
             return
-        if source.component != AUTOPILOT_COMPONENT:
-            self._odd_components.add(source.component)
+        if source.component != AUTOPILOT_COMPONENT or source.system == 0:
+            self._odd_ids.add(source)
             return
         vehicle = VehicleIdentity(
             source=source,
@@ -110,10 +110,9 @@ class VehicleDiscovery:
         is_replaced = any(heard_ns < self._begun_ns[e] < self._heard_ns[e] for e in others)
         return not others or (self._begun_ns[vehicle] < heard_ns and not is_replaced)
 
-    @property
-    def is_settling(self) -> bool:
+    def is_settling(self, now_ns: int) -> bool:
         """True if a vehicle was heard, but a second one may still appear."""
-        return self._first_ns is not None
+        return self._first_ns is not None and now_ns - self._first_ns < SETTLE_NS
 
     def choose(self, now_ns: int) -> VehicleIdentity | None:
         """Return the vehicle to fly, or None until it is certain.
@@ -135,7 +134,8 @@ class VehicleDiscovery:
             addresses = " and ".join(vehicle.place for vehicle in wanted)
             raise PeerError(
                 f"two vehicles use system id {systems[0]} (from {addresses}): give one of them "
-                "another id (MAV_SYSID, SYSID_THISMAV) or another port"
+                "another id (MAV_SYSID, SYSID_THISMAV) or another port; if it is one by two "
+                "routes, keep one of them off this port"
             )
         return wanted[0] if wanted else None
 
@@ -153,12 +153,17 @@ class VehicleDiscovery:
         self, address: LinkAddress, waited_s: float, connection: Connection, now_ns: int
     ) -> str:
         """Describe what was heard instead of the vehicle, with advice for this kind of link."""
-        if self._heard_ns:
+        if self._heard_ns and self._first_ns is None:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
             return f"{silent}, but system {heard} was heard: correct link.target_system"
-        if self._odd_components:
-            found = ", ".join(map(str, sorted(self._odd_components)))
+        if any(source.system == 0 for source in self._odd_ids):
+            return (
+                "an autopilot was heard as system 0, which means all systems: set MAV_SYSID, "
+                "SYSID_THISMAV or MAV_SYS_ID (PX4) to another"
+            )
+        if self._odd_ids:
+            found = ", ".join(map(str, sorted(source.component for source in self._odd_ids)))
             return (
                 f"an autopilot was heard as component {found}, and component "
                 f"{AUTOPILOT_COMPONENT} is flown: set MAV_COMP_ID (PX4) to {AUTOPILOT_COMPONENT}, "
@@ -166,6 +171,11 @@ class VehicleDiscovery:
             )
         if refused := connection.obstacles(now_ns):
             return "; ".join(refused)
+        if self._others and set(self._others.values()) == {connection.source}:
+            return (
+                "heard only what this computer sends, or another mavbridge: are TX and RX joined, "
+                "or does a router send packets back?"
+            )
         if self._others:
             return (
                 f"heard only {', '.join(sorted(self._others))}, which is no autopilot: connect to "
@@ -177,6 +187,11 @@ class VehicleDiscovery:
             )
             return f"the connection is lost ({connection.loss}): {advice}"
         amount = f"{connection.received_bytes / 1000 / max(waited_s, 0.1):.1f} kB/s came"
+        if 0 < connection.received_packets == connection.radio_packets:
+            return (
+                "heard only this end's telemetry radio (RADIO_STATUS): is the vehicle powered, and "
+                "its radio paired?"
+            )
         if connection.received_packets:
             return (
                 f"{amount}, MAVLink without a heartbeat of any sender: the link loses most of it, "
@@ -200,8 +215,13 @@ def _silence(address: LinkAddress, amount: str | None) -> str:
                 "crossed, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
                 "MAV_n_CONFIG on PX4)?"
             )
-        case _ if amount:
+        case UdpAddress(listens=True) if amount:
             return f"{amount}, and no MAVLink in it: another program sends to this port"
+        case _ if amount:
+            return (
+                f"{amount}, and no MAVLink in it: another service is at this address, or a bridge "
+                "to a serial port with another baud rate or protocol"
+            )
         case TcpAddress(port=port):
             return (
                 f"connected, and not a byte came: a simulator serves one client on TCP {port}: "

@@ -8,7 +8,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import AdviceText, Outlet, Packet
-from mavbridge.mavlink.codec.messages import ReceivedMessage
+from mavbridge.mavlink.codec.messages import Endpoint, ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.readers import UNKNOWN
 from mavbridge.mavlink.codec.signing import Refusal
@@ -116,12 +116,19 @@ class Connection:
         self.received_packets = 0
         """Number of packets with a valid checksum; noise looks like packets of unknown messages,
         which have none to test."""
+        self.radio_packets = 0
+        """Number of these that a telemetry radio has sent."""
         self._told_signatures = 0
         """Number of kinds of rejected signatures that were reported."""
         self.loss = ""
         """Cause of the last lost connection; empty once bytes have come again."""
         self._opened = 0
         self._open(clock.now_ns())
+
+    @property
+    def source(self) -> Endpoint:
+        """Our own system and component."""
+        return self._codec.source
 
     @property
     def is_down(self) -> bool:
@@ -186,6 +193,7 @@ class Connection:
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data, sender):
                     self.received_packets += message.name != UNKNOWN
+                    self.radio_packets += message.name == "RADIO_STATUS"
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
                     yield message, arrived_ns, sender

@@ -135,6 +135,8 @@ def test_a_vehicle_is_followed_however_often_it_moves() -> None:
         ([(Endpoint(255, 190), heartbeat(6, 8))], "heard only GCS (system 255, component 190)"),
         ([(Endpoint(1, 1), heartbeat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
         ([(Endpoint(1, 42), heartbeat(2, 3))], "as component 42"),
+        ([(Endpoint(0, 1), heartbeat(2, 3))], "as system 0, which means all systems"),
+        ([(Endpoint(255, 191), heartbeat(18, 8))], "heard only what this computer sends"),
     ],
 )
 def test_other_senders_are_described(
@@ -148,13 +150,15 @@ def test_other_senders_are_described(
 
 
 def hearing(
-    spec: str, received_bytes: int = 0, received_packets: int = 0, loss: str = ""
+    spec: str, received_bytes: int = 0, received_packets: int = 0, loss: str = "", radio: int = 0
 ) -> tuple[LinkAddress, float, Any, int]:
     heard = SimpleNamespace(
         obstacles=lambda _now_ns: [],
         received_bytes=received_bytes,
         received_packets=received_packets,
+        radio_packets=radio,
         loss=loss,
+        source=Endpoint(255, 191),
     )
     return parse_address(spec), 5.0, heard, 0
 
@@ -168,7 +172,8 @@ def hearing(
         (hearing("tcp:127.0.0.1:5760"), ("not a byte", "one client on TCP 5760")),
         (hearing("/dev/ttyACM0", 0, 0, "gone"), ("connection is lost (gone): plug it in",)),
         (hearing("tcp:127.0.0.1:5760", 99, 0, "ended"), ("lost (ended): is its server running?",)),
-        (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "another program")),
+        (hearing("/dev/ttyACM0", 90, 9, radio=9), ("this end's telemetry radio", "paired")),
+        (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "another service", "a bridge")),
         (hearing("udp:127.0.0.1:14550"), ("send to port 14550",)),
         (hearing("udpout:127.0.0.1:14550"), ("nobody answered",)),
         (hearing("udp:127.0.0.1:14550", 500), ("another program",)),
