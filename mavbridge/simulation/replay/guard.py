@@ -47,6 +47,7 @@ _OWN_ENDINGS = (
     *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
 )
 """Reasons for which the guard was asked to end."""
+_OF_SENDERS = frozenset((Code.MOVED, Code.MOVED_AT_REST, Code.REPLACED))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +65,14 @@ class GuardStep:
     stop: EndRequest | None
     told: tuple[tuple[int, Reason], ...]
     """When and why the guard was told, since the step before, that there is no usable chunk."""
+
+
+def unrepeatable(ticks: Sequence[Tick]) -> Iterator[str]:
+    """Yield what the replayed guard cannot repeat, for want of the senders of the packets."""
+    for reason in (tick.release_reason for tick in ticks):
+        if reason is not None and not _OF_SENDERS.isdisjoint(reason.codes):
+            yield f"a recording lacks the senders of packets, so this is not repeated: {reason}"
+            return
 
 
 def recorded_plan(source: ReplaySource) -> FlightPlan:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from helpers.golden_flights import FLIGHTS, copied
+from helpers.golden_flights import FLIGHTS, copied, golden
 from mavbridge.commands.config import ReplayConfig, ReplayFrom
 from mavbridge.commands.replay import (
     ENGINE_TOLERANCE,
@@ -18,6 +18,7 @@ from mavbridge.commands.replay import (
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import ExitCode, UserError
+from mavbridge.core.reasons import Code, because
 from mavbridge.recording.folder import SETTINGS
 from mavbridge.simulation.replay.recording import open_source
 
@@ -136,3 +137,19 @@ def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
     (folder / "link.tlog").unlink()
     with pytest.raises(UserError, match=r"link\.tlog"):
         replay(folder, ReplayConfig())
+
+
+def test_what_the_replay_cannot_repeat_is_told_with_the_verdict(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = because(Code.MOVED, before="10.0.0.1:14550", now="10.0.0.2:14550")
+    source = golden("numpy_px4")
+    last = replace(source.ticks[-1], release_reason=moved, phase="flying")
+    source = replace(source, ticks=(*source.ticks[:-1], last))
+    monkeypatch.setattr("mavbridge.commands.replay.open_source", lambda folder: source)
+
+    assert replay(NUMPY, ReplayConfig(source="chunks")) == ExitCode.DIFFERENT
+
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"senders of packets, so this is not repeated: {moved}" in shown
+    assert "NOT EQUAL, perhaps for the notes above" in shown
