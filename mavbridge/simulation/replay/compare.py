@@ -18,7 +18,7 @@ from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
 
 Array: TypeAlias = NDArray[np.float64]
-PAST_INPUTS = ("states", "history")
+PAST_INPUTS = ("states", "history", "moments")
 """Inputs that a policy with the recorded contract gets from the recording. Rebuilt ones may differ
 if the recording lacks a solve without a chunk, or a tick in transit."""
 
@@ -129,7 +129,8 @@ def _inputs(solve: Solve) -> dict[str, object]:
     state = solve.state
     return {
         "state": (state.values.tobytes(), state.extras),
-        "stamps": (attributes(state, STATE_STAMPS), solve.image_ns, solve.first_ns),
+        "stamps": (attributes(state, STATE_STAMPS), solve.image_ns),
+        "moments": solve.first_ns,
         "states": solve.states.tobytes(),
         "history": solve.history.tobytes(),
         "images": solve.frame_ids,
