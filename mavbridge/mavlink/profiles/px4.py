@@ -50,6 +50,8 @@ _UNEVEN_HZ = 150.0
 """Rate above which a request for the rate itself yields less than one for ``FAST_HZ``."""
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
 """Values of COM_RC_IN_MODE that exclude MAVLink's sticks."""
+_RECEIVER_FIRST, _FIRST_COME = (5, 7), (2, 3)
+"""Values of COM_RC_IN_MODE that prefer a receiver's sticks, and that keep the first source's."""
 _NO_RECEIVER = (1, 4)
 """Values of COM_RC_IN_MODE that exclude a receiver's sticks: only MAVLink's, or none."""
 _MAVLINK_FIRST = (6, 8)
@@ -248,7 +250,7 @@ class Px4(Profile):
         time = f"0.5; {_SHORTEST_S:g} to {LONGEST_S:g} s"
         if context.output == "manual-control":
             return {
-                "COM_RC_IN_MODE": "1, or 6 with a receiver",
+                "COM_RC_IN_MODE": "1; with a receiver 6 or 8",
                 "COM_RC_LOSS_T": time,
                 "NAV_RCL_ACT": "1, 2 or 3 (hold, return, land)",
                 "COM_RCL_EXCEPT": f"with {_EXCEPT_HOLD} in it",
@@ -341,10 +343,16 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
         effect = ": both sticks held down and outwards stop the motors, in flight too"
         yield ParamNote.of("obstacle", "MAN_KILL_GEST_T", time_s, effect, -1)
     mode = values.get("COM_RC_IN_MODE", 1.0)
+    or_else = " (MAVLink only), or 6 with a receiver (MAVLink first; PX4 1.17 and later)"
     if mode in _NO_MAVLINK_STICKS:
         why = f" ({_NO_MAVLINK_STICKS[int(mode)]})"
-        or_else = " (MAVLink only), or 6 with a receiver (MAVLink first; PX4 1.17 and later)"
         yield ParamNote.of("obstacle", "COM_RC_IN_MODE", mode, why, 1, or_else)
+    if mode in _RECEIVER_FIRST and context.has_receiver:
+        why = " (the receiver first)"
+        yield ParamNote.of("obstacle", "COM_RC_IN_MODE", mode, why, 6, " (MAVLink first)")
+    if mode in _FIRST_COME and context.has_receiver:
+        effect = ": PX4 ignores our sticks if the receiver was there first"
+        yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect, 1, or_else)
     if mode in _MAVLINK_FIRST and context.has_receiver:
         effect = (
             ": while our sticks flow PX4 ignores all switches of the transmitter: take over by "
@@ -353,18 +361,14 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
         yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect)
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
-        effect = (
-            f": in ALTCTL it leans no further, and full stick is {full_deg:g} deg "
-            "(MPC_MAN_TILT_MAX)"
-        )
+        full = f"{full_deg:g} deg (MPC_MAN_TILT_MAX)"
+        effect = f": in ALTCTL it leans no further, and full stick is {full}"
         yield ParamNote.of("advice", "MPC_TILTMAX_AIR", limit_deg, effect, full_deg)
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
         effect = ": in STABILIZED the middle of the throttle is half thrust, not hover thrust"
         yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
     if values.get("MAN_ARM_GESTURE") == 1:
-        effect = (
-            ": throttle down and full yaw for a second arms, which a policy on the ground might do"
-        )
+        effect = ": throttle down and full yaw for a second arms; a policy on the ground might"
         yield ParamNote.of("hint", "MAN_ARM_GESTURE", 1, effect, 0)
 
 

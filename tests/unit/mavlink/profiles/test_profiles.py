@@ -110,6 +110,8 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
         (PX4, {"MPC_THR_CURVE": 1.0}, "manual-control", None, ["--set MPC_THR_CURVE=0"]),
         (PX4, {"COM_RC_IN_MODE": 6.0}, "manual-control", True, ["take over by --engage-channel"]),
         (PX4, {"COM_RC_IN_MODE": 6.0}, "manual-control", False, []),
+        (PX4, {"COM_RC_IN_MODE": 3.0}, "manual-control", True, ["the receiver was there first"]),
+        (PX4, {"COM_RC_IN_MODE": 3.0}, "manual-control", False, []),
         (PX4, {"MPC_THR_CURVE": 1.0, "MPC_TILTMAX_AIR": 1.0}, "rates", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", None, []),
         (PX4, {"COM_OF_LOSS_T": 5.0}, "velocity", None, ["--set COM_OF_LOSS_T=0.5"]),
@@ -215,14 +217,19 @@ def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "refused", "mended"),
-    [("COM_RC_IN_MODE", range(9), (0, 4), 1), ("MAN_KILL_GEST_T", (-1, 0, 2), (0, 2), -1)],
+    ("name", "values", "receiver", "refused", "mended"),
+    [
+        ("COM_RC_IN_MODE", range(9), False, (0, 4), 1),
+        ("COM_RC_IN_MODE", (0, 1, 2, 3, 4, 6, 8), True, (0, 4), 1),
+        ("COM_RC_IN_MODE", (5, 7), True, (5, 7), 6),
+        ("MAN_KILL_GEST_T", (-1, 0, 2), None, (0, 2), -1),
+    ],
 )
 def test_sticks_of_mavlink_must_be_taken_and_no_gesture_may_stop_the_motors(
-    name: str, values: Iterable[int], refused: tuple[int, ...], mended: int
+    name: str, values: Iterable[int], receiver: bool | None, refused: tuple[int, ...], mended: int
 ) -> None:
     for value in values:
-        found = notes_of(PX4, {name: float(value)}, "manual-control")
+        found = notes_of(PX4, {name: float(value)}, "manual-control", has_receiver=receiver)
         assert [note.cure for note in found] == [f"--set {name}={mended}"] * (value in refused)
         assert notes_of(PX4, {name: float(value)}, "rates") == []
         is_ignored = name == "COM_RC_IN_MODE" and value in (1, 4)
