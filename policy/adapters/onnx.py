@@ -50,7 +50,6 @@ class RoleGraph:
     def __init__(
         self, graph: Graph, shapes: Mapping[str, Sequence[int]], hidden: Mapping[str, Shape]
     ) -> None:
-        """Take a compiled graph, the shape of each input by role, in order, and the hidden ones."""
         self._graph, self._shapes, self._hidden_shapes = graph, shapes, hidden
         self.reset()
 
@@ -116,10 +115,8 @@ class GraphFile:
         self._make_static({role: each.shape for role, each in inputs.items()} | self.hidden)
         for port in self._model.outputs:
             if (shape := port.get_partial_shape()).is_dynamic:
-                raise CheckpointError(
-                    f"{path}: an output has the shape {shape}, which depends on the values of the "
-                    "inputs: export a graph whose outputs have one size"
-                )
+                why = "which depends on the values of the inputs: export one of a fixed size"
+                raise CheckpointError(f"{path}: an output has the shape {shape}, {why}")
         self.output_shape = tuple(self._model.outputs[0].shape)
 
     @signal_stack_kept()

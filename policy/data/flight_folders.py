@@ -135,18 +135,9 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     contract = _contract(name, meta)
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
-    first, *others = contract.cameras
     damage: list[str] = []
-    if camera is None:
-        damage = [
-            f"{folder}: camera {other} is left out, only the first is read" for other in others
-        ]
-    elif not others and camera != first:
-        damage = [f"{folder}: it has no camera {camera}: its only one, {first}, is read"]
-    elif camera not in (None, first, *others):
-        raise DatasetError(f"{folder}: no camera {camera}; it has {[first, *others]}")
+    suffix = _camera_suffix(folder, contract.cameras, camera, damage)
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
-    suffix = f"_{camera}" if camera in others else ""
     frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
     video = folder / f"camera{suffix}.mp4"
     if not video.is_file() or frames.num_rows == 0:
@@ -189,6 +180,22 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
         decode=partial(decode_video, video, numbers),
         damage=tuple(damage),
     )
+
+
+def _camera_suffix(
+    folder: Path, cameras: Sequence[str], camera: str | None, damage: list[str]
+) -> str:
+    """Return the end of the names of a camera's files; note in ``damage`` what is not read."""
+    first, *others = cameras
+    if camera is None:
+        damage += [
+            f"{folder}: camera {each} is left out, only the first is read" for each in others
+        ]
+    elif not others and camera != first:
+        damage.append(f"{folder}: it has no camera {camera}: its only one, {first}, is read")
+    elif camera not in cameras:
+        raise DatasetError(f"{folder}: no camera {camera}; it has {list(cameras)}")
+    return f"_{camera}" if camera in others else ""
 
 
 def _sticks(
