@@ -190,7 +190,7 @@ class GuardProcess:
         asked = f", then {words.mode}" if words.mode else ""
         return (
             f"its last words were sent in its place (neutral{asked}), but the answer cannot be "
-            "received: take over the vehicle"
+            "received: take over the vehicle; without a receiver its own failsafe may follow"
         )
 
     def _transmit(self, packet: bytes, receiver: SocketAddress | None) -> bool:
