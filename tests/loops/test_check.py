@@ -16,10 +16,10 @@ from mavbridge.mavlink.transport.connection import Address
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
-from policy.contract import Contract
+from policy.contract import ActionKind, Contract
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, AutopilotName
 
 OVERRIDE = 70
 """RC_CHANNELS_OVERRIDE."""
@@ -33,7 +33,7 @@ class Bench:
         self,
         autopilot: AutopilotName = "ardupilot",
         *,
-        receiver: bool = True,
+        receiver_us: tuple[int, ...] | None = MID_RECEIVER_US,
         position: bool = True,
         params: dict[str, float] | None = None,
     ) -> None:
@@ -44,7 +44,7 @@ class Bench:
             config=replace(
                 NOMINAL_VEHICLE,
                 autopilot=autopilot,
-                receiver_us=MID_RECEIVER_US if receiver else None,
+                receiver_us=receiver_us,
                 position_ready_s=NOMINAL_VEHICLE.position_ready_s if position else math.inf,
             ),
         )
@@ -107,14 +107,14 @@ def test_an_ardupilot_that_is_set_up_is_a_go() -> None:
         assert float(rows[name].found.split()[0]) == pytest.approx(100, abs=2)
 
 
-@pytest.mark.parametrize("receiver", [True, False])
-def test_a_px4_is_told_what_its_sticks_cannot_do(receiver: bool) -> None:
-    bench = Bench("px4", receiver=receiver, params={"COM_RC_IN_MODE": 1})
+@pytest.mark.parametrize("receiver_us", [MID_RECEIVER_US, None])
+def test_a_px4_is_told_what_its_sticks_cannot_do(receiver_us: tuple[int, ...] | None) -> None:
+    bench = Bench("px4", receiver_us=receiver_us, params={"COM_RC_IN_MODE": 1})
     rows = bench.check(contract=Contract(), echo_test=True)
 
     assert "no-go" not in verdicts(rows).values(), verdicts(rows)
     assert rows["modes"].found == "ALTCTL"
-    assert rows["radio receiver"].found.split()[0] == ("ignored" if receiver else "none")
+    assert rows["radio receiver"].found.split()[0] == ("ignored" if receiver_us else "none")
     assert "sticks are mapped" in rows["full lean"].found
     assert rows["full yaw rate"].verdict == "warn"
     assert "202 deg/s" in rows["full yaw rate"].advice
@@ -167,7 +167,7 @@ def test_an_echo_that_needs_set_is_no_no_go(name: str, value: float, mended: flo
 
 
 def test_without_a_receiver_its_failsafes_count() -> None:
-    bench = Bench(receiver=False, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
+    bench = Bench(receiver_us=None, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
     rows = bench.check(contract=Contract())
     assert rows["radio receiver"].verdict == "warn"
     assert rows["FS_THR_ENABLE"].verdict == "no-go"
@@ -188,6 +188,19 @@ def test_a_receiver_that_is_ignored_has_a_remedy_for_each_firmware() -> None:
     row = bench.check(contract=Contract())["radio receiver"]
     assert (row.found, row.verdict) == ("ignored by a parameter", "warn")
     assert "RC_OPTIONS bit 0" in row.advice
+
+
+@pytest.mark.parametrize("receiver_us", [IDLE_RECEIVER_US, None])
+@pytest.mark.parametrize("action", ["sticks", "velocity"])
+def test_only_sticks_that_end_give_the_vehicle_to_the_receiver(
+    action: ActionKind, receiver_us: tuple[int, ...] | None
+) -> None:
+    row = Bench(receiver_us=receiver_us, params=SAFE).check(contract=Contract(action=action))[
+        "radio receiver"
+    ]
+    assert row.verdict == "warn"
+    assert ("RC_OVERRIDE_TIME" in row.advice) == (action == "sticks")
+    assert ("put the throttle in the middle" in row.advice) == (receiver_us is not None)
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])

@@ -326,7 +326,7 @@ def _vehicle_rows(
             no_go=lacking if terms.mode is None else "",
         )
     if status is not None:
-        yield from _status_rows(vehicle, status)
+        yield from _status_rows(terms, status)
     if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
         refuses = (
             "the autopilot would refuse to arm now; it says why as PreArm texts, also to a ground "
@@ -338,7 +338,7 @@ def _vehicle_rows(
         yield _row("override switch", "off", "on", warn=str(vehicle.switch_problem))
 
 
-def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[CheckRow]:
+def _status_rows(terms: Terms, status: VehicleStatus) -> Iterator[CheckRow]:
     found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
     if status.is_failsafe:
         text = "a failsafe of the vehicle is active"
@@ -348,7 +348,7 @@ def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[Che
         yield _row("state", found, "disarmed", warn=text)
     else:
         yield _row("state", found, "disarmed, no failsafe")
-    yield _receiver_row(vehicle, status)
+    yield _receiver_row(terms, status)
     position = {True: "valid", False: "none", None: "the estimator does not say"}
     text = "without a position, hold is LAND, and the autopilot does not take off by itself"
     is_lacking = status.is_position_valid is False
@@ -358,33 +358,37 @@ def _status_rows(vehicle: VehicleSession, status: VehicleStatus) -> Iterator[Che
         yield _row("battery", "low", "charged", no_go=str(status.battery_problem))
 
 
-def _receiver_row(vehicle: VehicleSession, status: VehicleStatus) -> CheckRow:
-    name, expected = "radio receiver", "a pilot who can take over"
+def _receiver_row(terms: Terms, status: VehicleStatus) -> CheckRow:
+    vehicle, name, expected = terms.vehicle, "radio receiver", "a pilot who can take over"
     if vehicle.params.traits.ignores_receiver and vehicle.condition.has_receiver:
         remedy = "clear RC_OPTIONS bit 0 (ArduPilot), or set COM_RC_IN_MODE to 6 (PX4 1.17)"
         text = f"neither its sticks nor its switches count: {remedy}"
         return _row(name, "ignored by a parameter", expected, text)
     if not status.has_receiver:
-        return _row(
-            name,
-            "none seen" if status.has_receiver is False else "not known",
-            expected,
-            "without a receiver nobody takes over by stick, and neutral sticks go on after a "
-            "flight until the vehicle is disarmed or its mode is changed; if this computer died, "
-            "its radio failsafe would act (ArduPilot: RTL after RC_FS_TIMEOUT, 1 s, whatever "
-            "RC_OVERRIDE_TIME)",
-        )
+        text = "without a receiver nobody takes over by stick"
+        if terms.is_sticks:
+            text += (
+                ", and neutral sticks go on after a flight until the vehicle is disarmed or its "
+                "mode is changed; if this computer died, its radio failsafe would act (ArduPilot: "
+                "RTL after RC_FS_TIMEOUT, 1 s, whatever RC_OVERRIDE_TIME)"
+            )
+        found = "none seen" if status.has_receiver is False else "not known"
+        return _row(name, found, expected, text)
     throttle = status.pilot_sticks.throttle if status.pilot_sticks else None
     if throttle is None or abs(throttle) <= MIDDLE_STICK:
         return _row(name, "there", expected)
+    text = "a pilot who takes over by changing the mode gets such a throttle at once"
+    if terms.is_sticks:
+        text = (
+            "sticks are not released to such a throttle in the air; if this computer died, the "
+            "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
+            "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3)"
+        )
     return _row(
         name,
         f"throttle at {100 * throttle:+.0f} %",
         f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight",
-        "sticks are not released to such a throttle in the air; if this computer died, the "
-        "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
-        "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3): put the throttle "
-        "in the middle before the policy flies",
+        f"{text}: put the throttle in the middle before the policy flies",
     )
 
 
