@@ -106,7 +106,9 @@ class TimesyncFilter:
             self._trusted_ns = now_ns
         elif not self._has_told and now_ns - self._trusted_ns > _TRUST_NS:
             self._has_told = True
-            fault = "answers disagree" if self._clocks else "is not answered (a router drops it?)"
+            fault = "is not answered in time (a router drops it, or the link is slow)"
+            if self._clocks:
+                fault = "answers are too few, or disagree"
             effect = "ages count from arrival, so a delay of the link is not seen"
             self._report(AdviceText(f"TIMESYNC {fault}: {effect}"))
         return now_ns

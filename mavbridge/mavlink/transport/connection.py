@@ -51,6 +51,9 @@ class Received(NamedTuple):
 class TransportDownError(Exception):
     """The peer or the port is gone; reopening may help."""
 
+    is_silence = False
+    """True if nothing is known but that no bytes came."""
+
 
 class Transport(Protocol):
     """Non-blocking connection to a vehicle; not thread-safe."""
@@ -120,8 +123,8 @@ class Connection:
         """Number of these that a telemetry radio has sent."""
         self._told_signatures = 0
         """Number of kinds of rejected signatures that were reported."""
-        self.loss = ""
-        """Cause of the last lost connection; empty once bytes have come again."""
+        self._told_loss = self.loss = ""
+        """Last lost connection that was told, and its known cause; empty once bytes have come."""
         self._opened = 0
         self._open(clock.now_ns())
 
@@ -174,8 +177,10 @@ class Connection:
     def _lose(self, error: TransportDownError | UserError, now_ns: int) -> None:
         self._transport.close()
         self._reopen_ns = now_ns + REOPEN_NS
-        if str(error) != self.loss:
-            self.loss = str(error)
+        is_silence = isinstance(error, TransportDownError) and error.is_silence
+        self.loss = "" if is_silence else str(error)
+        if str(error) != self._told_loss:
+            self._told_loss = str(error)
             self.report(f"connection lost ({error}); reconnecting")
 
     def receive(self) -> Iterator[Arrival]:
@@ -188,7 +193,7 @@ class Connection:
         try:
             for data, arrived_ns, sender in self._transport.drain():
                 self.received_bytes += len(data)
-                self.loss = ""
+                self._told_loss = self.loss = ""
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data, sender):

@@ -230,7 +230,9 @@ class TcpTransport(_FileTransport[socket.socket]):
             self._heard_ns = self._clock.now_ns()
             yield Received(data, self._heard_ns, None)
         if self._handle is not None and self._clock.now_ns() - self._heard_ns > TCP_SILENCE_NS:
-            raise self._down(f"silent for {TCP_SILENCE_NS // NS_PER_S} s")
+            silence = self._down(f"silent for {TCP_SILENCE_NS // NS_PER_S} s")
+            silence.is_silence = True
+            raise silence
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """See `Transport`."""

@@ -227,8 +227,9 @@ def test_a_silent_tcp_connection_is_taken_for_dead() -> None:
     with tcp_pair(clock) as (ours, _):
         assert list(ours.drain()) == []
         clock.advance_ns(TCP_SILENCE_NS + 1)
-        with pytest.raises(TransportDownError, match="silent for 5 s"):
+        with pytest.raises(TransportDownError, match="silent for 5 s") as down:
             list(ours.drain())
+    assert down.value.is_silence  # a busy simulator, perhaps: no loss that explains it
 
 
 @pytest.mark.parametrize("is_read", [False, True])
