@@ -243,6 +243,8 @@ class _Flight:
         has_keys = not self._config.link.readonly and keyboard.start()
         screen.start(hint=KEYS_HINT if has_keys else None)
         referee = self._observers.referee
+        has_act = has_keys or self._config.engage_channel is not None
+        released = 0
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
                 ending = EndRequest(reason=fault, is_fault=True)
@@ -251,6 +253,10 @@ class _Flight:
                 ending = over
                 break
             stop.wait(1 / STATUS_HZ)
+            released = released + 1 if bridge.view.phase is Phase.RELEASED else 0
+            if released == 2 and not has_act:  # seen twice: it does not end by itself
+                where = "here (no terminal, no --engage-channel)"
+                screen.show_message(f"nothing can engage again {where}: end with Ctrl-C or SIGTERM")
         else:
             has_died = self._guard.summary is None and not stop.is_set()
             ending = self._ending if has_died else EndRequest(reason=because(Code.SIGNAL))
