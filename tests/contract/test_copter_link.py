@@ -13,7 +13,7 @@ def test_the_version_comes_on_request(companion):
     )
     version = companion.wait("AUTOPILOT_VERSION")
     assert result == ACCEPTED
-    assert version.flight_sw_version >> 16 == 4 << 8 | 7
+    assert version.flight_sw_version >> 16 in (4 << 8 | 7, 4 << 8 | 8)
     assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 
 

@@ -254,7 +254,8 @@ def test_a_takeoff_ends_at_its_height_alt_hold_keeps_it_and_land_disarms_on_the_
     held = last(grounded.hold(3.0), "LOCAL_POSITION_NED").z
     assert held == pytest.approx(end, abs=0.4)
     grounded.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
-    grounded.set_param("LAND_SPEED", 150.0)
+    speed = grounded.read_param("LAND_SPEED", "LAND_SPD_MS")  # cm/s; m/s in ArduCopter 4.8
+    grounded.set_param(speed.param_id, 3.0 * speed.param_value)
     assert grounded.set_mode(LAND) == ACCEPTED
     landing = grounded.hold(0.5)
     assert last(landing, "EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_LANDING

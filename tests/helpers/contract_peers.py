@@ -202,14 +202,14 @@ class Companion:
     def get_param(self, name: str) -> float:
         return float(self.read_param(name).param_value)
 
-    def read_param(self, name: str) -> Any:
-        """Return PARAM_VALUE as received."""
-        for _ in range(3):
+    def read_param(self, *names: str) -> Any:
+        """Return PARAM_VALUE, as received, of the first of these names that the vehicle knows."""
+        for name in names * 3:
             self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
-            message = self.find("PARAM_VALUE", 1.0, lambda m: m.param_id == name)
+            message = self.find("PARAM_VALUE", 1.0, lambda m, name=name: m.param_id == name)
             if message is not None:
                 return message
-        return pytest.fail(f"no parameter {name}")
+        return pytest.fail(f"no parameter {' or '.join(names)}")
 
     def set_param(self, name: str, value: float) -> float:
         """Set a parameter until the end of the test; return its value afterwards."""
