@@ -132,7 +132,7 @@ class ExportConfig:
         size = self.image_size
         if size is not None and (size % 2 or not 16 <= size <= 4096):
             raise UserError(f"--image-size {size}: an even number from 16 to 4096")
-        if not self.task.strip() or not self.task.isprintable():
+        if not self.task.strip() or any("\ud800" <= each <= "\udfff" for each in self.task):
             raise UserError("--task must be words, in UTF-8: describe what the flights do")
 
 

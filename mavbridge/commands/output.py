@@ -53,7 +53,7 @@ def require_outputs(json_file: Path | None, plot: Path | None) -> None:
     Raises:
         UserError: a file cannot be written or is no picture, or matplotlib is not installed.
     """
-    if plot is not None and plot.suffix not in PICTURES:
+    if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UserError(f"--plot {plot}: name a file that ends in {', '.join(PICTURES)}")
     require_writable(json_file, "--json")
     require_writable(plot, "--plot")

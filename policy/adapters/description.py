@@ -5,6 +5,7 @@ The description is beside the graphs or inside an archive: docs/policy_exported.
 """
 
 import json
+import os
 import re
 import zipfile
 import zlib
@@ -221,9 +222,10 @@ def _lacking(path: Path, error: Exception) -> str | None:
         return f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"
     if _MISMATCH not in str(error):
         return None
-    others = (each for each in sorted(path.parent.iterdir()) if each != path and each.is_file())
-    for beside in others:
-        if (stands_in := stand_in(beside)) is not None:
+    graph = path.read_bytes()
+    for beside in sorted(path.parent.iterdir()):
+        is_named = os.fsencode(beside.name) in graph
+        if is_named and beside.is_file() and (stands_in := stand_in(beside)) is not None:
             return f"{beside}, beside {path.name}, is {stands_in[0]}: {stands_in[1]}"
     return (
         f"{path.parent}: the file with the weights of {path.name} is cut short, or of another "

@@ -228,7 +228,7 @@ class GraphFile:
             sizes = list(declared) if declared.rank.is_static else []
             is_reshaped = role != "image" and 0 < len(sizes) != len(shapes[port])
             if is_reshaped and math.prod(_sizes(port)[1:]) == math.prod(shapes[port][1:]):
-                shapes[port] = list(_sizes(port))  # the same numbers, flat or with more axes
+                shapes[port] = [1, *_sizes(port)[1:]]  # the same numbers, flat or with more axes
                 continue
             axes = zip(reversed(sizes), reversed(shapes[port][1:]), strict=False)  # no batch
             if any(axis.is_static and axis.get_length() != size for axis, size in axes):
