@@ -106,7 +106,7 @@ class FlightReferee:
 
     @property
     def end(self) -> FlightEnd:
-        """How the policy's last flight ended, by its reason alone."""
+        """Kind of end of the policy's last flight, by its reason alone."""
         if self.reason is None:
             return "fault"
         taken: FlightEnd = "takeover" if self.reason.kind is Kind.PILOT else "fault"

@@ -118,7 +118,7 @@ class Guard:
 
     @property
     def ways_out(self) -> str:
-        """What a hand can do to end the neutral sticks of HOLDING, in words."""
+        """Acts that end the neutral sticks of HOLDING, in words."""
         # PX4 ignores the transmitter's own switches while our sticks flow.
         is_px4 = self._seen is not None and self._seen.link.modes.override
         place = " by a ground station" if is_px4 else ""

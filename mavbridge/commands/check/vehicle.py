@@ -359,8 +359,8 @@ def _status_rows(terms: Terms, status: VehicleStatus) -> Iterator[CheckRow]:
 
 
 def _receiver_row(terms: Terms, status: VehicleStatus) -> CheckRow:
-    vehicle, name, expected = terms.vehicle, "radio receiver", "a pilot who can take over"
-    if vehicle.params.traits.ignores_receiver and vehicle.condition.has_receiver:
+    name, expected = "radio receiver", "a pilot who can take over"
+    if terms.vehicle.params.traits.ignores_receiver and terms.vehicle.condition.has_receiver:
         remedy = "clear RC_OPTIONS bit 0 (ArduPilot), or set COM_RC_IN_MODE to 6 (PX4 1.17)"
         text = f"neither its sticks nor its switches count: {remedy}"
         return _row(name, "ignored by a parameter", expected, text)
@@ -384,12 +384,9 @@ def _receiver_row(terms: Terms, status: VehicleStatus) -> CheckRow:
             "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
             "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3)"
         )
-    return _row(
-        name,
-        f"throttle at {100 * throttle:+.0f} %",
-        f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight",
-        f"{text}: put the throttle in the middle before the policy flies",
-    )
+    found = f"throttle at {100 * throttle:+.0f} %"
+    expected = f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight"
+    return _row(name, found, expected, f"{text}: put the throttle in the middle first")
 
 
 def _text_rows(texts: Sequence[str]) -> Iterator[CheckRow]:

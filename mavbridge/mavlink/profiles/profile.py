@@ -184,7 +184,7 @@ class ParamContext(NamedTuple):
 
 
 class Traits(NamedTuple):
-    """What a vehicle's parameters make of it."""
+    """Properties of a vehicle that follow from its parameters."""
 
     override_switch: int | None = None
     """Number of the radio channel that enables overrides."""
