@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.factories import START_NS
+from helpers.recordings import InProcessWriter
 from helpers.rollouts import (
     SIZE,
     TINY,
@@ -28,7 +29,6 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import Contract
 
 
@@ -142,14 +142,15 @@ def test_the_history_is_in_seconds_before_and_after_the_start() -> None:
 def test_no_frame_is_held_for_longer_than_a_queue_is_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames, seen, held, submit = 4, list[weakref.ref[object]](), list[int](), VideoWriter.submit
+    frames, seen, held = 4, list[weakref.ref[object]](), list[int]()
+    submit = InProcessWriter.submit
 
-    def watched(video: VideoWriter, rgb: ImageArray, row: FrameRow) -> None:
+    def watched(video: InProcessWriter, rgb: ImageArray, row: FrameRow) -> None:
         seen.append(weakref.ref(rgb))
         held.append(sum(one() is not None for one in seen))
         submit(video, rgb, row)
 
-    monkeypatch.setattr(VideoWriter, "submit", watched)
+    monkeypatch.setattr(InProcessWriter, "submit", watched)
     run(
         tmp_path / "a.mp4",
         make_plan(iterations=96, frames=frames, exe_steps=2),

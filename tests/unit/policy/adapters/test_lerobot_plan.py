@@ -191,12 +191,10 @@ def test_processors_that_are_not_supported_are_refused(folder):
         save_file(load_file(path) | {key: np.zeros(size, np.float32)}, path)
         with pytest.raises(CheckpointError, match=rf"must have \d+ numbers, got .*: {size}"):
             read_plan(folder, None)
-    for kind in (torch.bfloat16, torch.float8_e4m3fn):
-        save_tensors({"observation.state.min": torch.zeros(13).to(kind)}, path)
-        with pytest.raises(
-            CheckpointError, match=r"of a type that numpy lacks .*: save them as fl"
-        ):
-            read_plan(folder, None)
+    # NumPy has bfloat16 where another package adds it, and no float8.
+    save_tensors({"observation.state.min": torch.zeros(13).to(torch.float8_e4m3fn)}, path)
+    with pytest.raises(CheckpointError, match=r"of a type that numpy lacks .*: save them as fl"):
+        read_plan(folder, None)
     shutil.copy(GOLDENS / "diffusion" / STATISTICS, path)
     step = {"registry_name": "relative_actions_processor", "config": {}}
     edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
