@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.switch import GAP_NS
 from mavbridge.core.vehicle import OnFault
 from mavbridge.guard.values import (
     Actions,
@@ -264,7 +265,9 @@ class DisengageSequence:
             return because(Code.NO_RECEIVER)
         if now.status.is_landed:
             return None
-        if now.status.is_receiver_sick:
+        # The silence of the whole vehicle tells nothing about its receiver.
+        is_heard = now.heard_ns is None or now.now_ns - now.heard_ns <= GAP_NS / 2
+        if now.status.is_receiver_sick or (is_heard and not any(now.status.rc_channels_us)):
             return because(Code.RECEIVER_LOST)
         if now.link.modes.is_silence_failsafe and not self.settings.is_setpoint:
             return because(Code.SILENCE_IS_FAILSAFE)
