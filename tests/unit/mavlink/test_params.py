@@ -135,6 +135,16 @@ def px4_vehicle(changes: dict[str, float | None] | None = None, **settings: Any)
     return ParamVehicle(profile=PX4, output=output, values=values, **settings)
 
 
+def test_a_receiver_that_is_switched_on_in_flight_is_an_obstacle_after_it() -> None:
+    vehicle = px4_vehicle({"COM_RC_IN_MODE": 5.0})
+    vehicle.has_receiver = False
+    after_reading(vehicle).armed = True
+    vehicle.has_receiver = True
+    assert vehicle.problem() is None
+    vehicle.armed = False
+    assert vehicle.problem().code is Code.OBSTACLE
+
+
 def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> None:
     vehicle = ParamVehicle({"FS_THR_ENABLE": None})
     vehicle.run(10.0)

@@ -241,6 +241,8 @@ class VehicleParams:
     def _current(self, status: VehicleStatus | None) -> Assessment:
         """Return the assessment of the present values, output and receiver."""
         has_receiver = None if status is None else status.has_receiver
+        if status is not None and status.armed and self._context.has_receiver is False:
+            has_receiver = False  # switched on in flight: its pilot takes over, which is no fault
         if has_receiver != self._context.has_receiver:
             self._context = self._context._replace(has_receiver=has_receiver)
         if self._assessed is None or self._assessed.context is not self._context:
