@@ -35,6 +35,8 @@ class _Stream:
     def __init__(self, group: StreamGroup) -> None:
         self.has_settled = False
         """True if it has been granted or given up once."""
+        self.was_settled = False
+        """True if it had been when the counting window began."""
         self.received: Counter[str] = Counter()
         """Messages by name: a vehicle may also send another one of the group unrequested."""
         self.newest_ns = self.stand_in_due_ns = 0
@@ -215,6 +217,7 @@ class StreamRequester:
             self._judge((now_ns - self._window_ns) / NS_PER_S)
         self._window_ns = now_ns
         for stream in self._streams:
+            stream.was_settled = stream.has_settled
             stream.received.clear()
 
     def _judge(self, span_s: float) -> None:
@@ -228,7 +231,8 @@ class StreamRequester:
             group, rate_hz = stream.group, stream.arriving_hz(span_s)
             is_rare = stream.is_settled and rate_hz <= _RARE * stream.rate_hz
             is_lacking = not stream.received or (is_rare and group.least_hz is None)
-            if group.without and is_lacking and share is None and not stream.is_absence_told:
+            may_tell = share is None and stream.was_settled and not stream.is_absence_told
+            if group.without and is_lacking and may_tell:
                 stream.is_absence_told = True
                 comes = f"comes at {rate_hz:.1g} Hz" if stream.received else "does not come"
                 self._report(f"{group.messages[0]} {comes}: {group.without}")

@@ -165,6 +165,8 @@ class Link:
         self._now_ns = 0
         self.silent: set[int] = set()
         """Messages that the vehicle grants and does not send."""
+        self.unanswered: set[int] = set()
+        """Requests, counted from 1, whose answers are lost."""
         self.stand_ins = 0
 
     def run(self, duration_s: float) -> None:
@@ -173,7 +175,8 @@ class Link:
             if (request := self.requester.step(self._now_ns)) is not None:
                 self.asked.append((int(request.params[0]), 1e6 / request.params[1]))
                 self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
-                self.requester.receive_ack(ack(0))
+                if len(self.asked) not in self.unanswered:
+                    self.requester.receive_ack(ack(0))
             self.stand_ins += len(list(self.requester.stand_ins(self._now_ns)))
             self.share = min(1.0, self.capacity_hz / max(sum(self.rates_hz.values()), 1.0))
             for number, rate_hz in self.rates_hz.items():
@@ -235,6 +238,13 @@ def test_rare_heartbeats_are_told_once(beats_hz: float, texts: int) -> None:
         link.rates_hz[IDS["HEARTBEAT"]] = beats_hz  # whatever was granted
         link.run(0.1)
     assert [text.partition(":")[0] for text in link.texts] == ["HEARTBEAT comes at 1 Hz"] * texts
+
+
+def test_a_stream_that_is_granted_late_is_not_missed_before() -> None:
+    link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
+    link.unanswered = {5, 6, 7, 8}  # for the length of the first counting window
+    link.run(10.0)
+    assert link.texts == []
 
 
 @pytest.mark.parametrize(
