@@ -146,7 +146,7 @@ def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
     if problem is None and m.starting_ns is not None:
         why = now.chunk_problem or because(Code.NO_CHUNK)
         problem = because(Code.NO_CHUNK_SINCE_RESET, why=why)
-    if problem is None:
+    if problem is None and (problem := objection(m, now)) is None:
         problem = because(
             Code.NOT_READY,
             after_s=m.allowed_ns / NS_PER_S,

@@ -253,6 +253,8 @@ CASES = {
         RELEASE, why=Code.NOT_READY),
     "not late for a climb yet": Case(lambda: after(partial(arming, takeoff_m=100.0), 189.9), {},
         PREPARING, IDLE, "GUIDED"),
+    "late, and the switch is not seen": Case(lambda: after(partial(arming, engage_channel=7), 89.91,
+        **NO_CHANNELS), {}, RELEASING, RELEASE, why=Code.ENGAGE_SWITCH_UNSEEN),
     "late for an act": Case(lambda: after(asked, 3.0), {}, RELEASED, why=Code.NOT_READY,
         refusal=Code.NOT_READY),
     "late in our OFFBOARD": Case(lambda: after(entering, 2.87), {}, LEAVING, NEUTRAL, "AUTO.LAND",
