@@ -24,6 +24,7 @@ from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import Envelope
 from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
 from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.table import switch_unseen
 from mavbridge.guard.values import (
     NOT_FOUND,
     Actions,
@@ -120,9 +121,10 @@ class Guard:
     def ways_out(self) -> str:
         """Acts that end the neutral sticks of HOLDING, in words."""
         # PX4 ignores the transmitter's own switches while our sticks flow.
-        is_px4 = self._seen is not None and self._seen.link.modes.override
-        place = " by a ground station" if is_px4 else ""
-        switch = ", or put the engage switch low" if self._engagement.heeds_switch else ""
+        seen, engagement = self._seen, self._engagement
+        place = " by a ground station" if seen is not None and seen.link.modes.override else ""
+        is_heeded = engagement.heeds_switch and seen and switch_unseen(engagement, seen) is None
+        switch = ", or put the engage switch low" if is_heeded else ""
         return f"you disarm or change the mode{place}{switch}"
 
     def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:

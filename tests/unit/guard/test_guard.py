@@ -371,6 +371,17 @@ def test_where_neutral_may_not_have_been_sent_px4_is_not_asked_for_a_mode_at_onc
     assert ("AUTO.LOITER" in asked) == (fault is None)
 
 
+def test_a_switch_that_is_not_seen_is_no_way_out() -> None:
+    roles = replace(PX4_MODES, is_silence_failsafe=False)
+    status = {"mode": "ALTCTL", "has_receiver": True, "rc_channels_us": (1500,) * 8}
+    guard = Stepped(roles=roles, modes=("ALTCTL",), engage_channel=7, status=status).engaged()
+    guard.step(40, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+    assert guard.guard.ways_out.endswith(", or put the engage switch low")
+    for at_ms in range(50, 1200, 10):
+        guard.step(at_ms, rc_channels_us=())
+    assert guard.guard.ways_out == "you disarm or change the mode by a ground station"
+
+
 def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     guard = Stepped().engaged()
     for at_ms in range(40, 740, 10):
