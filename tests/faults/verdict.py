@@ -1,5 +1,6 @@
 """Judges a flown scenario by the vehicle's own record and the bridge's messages."""
 
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -89,7 +90,8 @@ def judge(
 def _wrong(verdict: Verdict, report: VehicleReport, sent: list[Sent]) -> Iterator[str]:
     if "Traceback" in verdict.output:
         yield "it prints a traceback"
-    if verdict.exit == ExitCode.FAULT and "ended by a signal" in verdict.output:
+    outcome = re.search(r"^\s*ended by a signal", verdict.output, re.M)
+    if verdict.exit == ExitCode.FAULT and outcome is not None:
         yield "it ended by a fault, and blames a signal"
     if "the guard process has died" in verdict.output and ", now armed in" in verdict.output:
         yield "it claims to know the mode without a guard"
