@@ -215,7 +215,7 @@ class Guard:
                 for name, pair in readings.items()
                 if any(pair)
             },
-            lag_ns=max(0, 0, *(each.delay_ns for each in readings["attitude"] if each)),
+            lag_ns=max([0, *(each.delay_ns for each in readings["attitude"] if each)]),
             arriving=given.chunk,
         )
 
