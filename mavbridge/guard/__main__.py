@@ -45,9 +45,8 @@ def main() -> None:
     """Serve one flight process until control has been given back."""
     for name in _SURVIVED:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
-    port, samples = (
-        SocketPort(socket.socket(fileno=int(fd)), peer_pid=os.getppid()) for fd in sys.argv[1:]
-    )
+    ends = [socket.socket(fileno=int(fd)) for fd in sys.argv[1:]]
+    port, samples = SocketPort(ends[0], peer_pid=os.getppid()), SocketPort(ends[1])
     select.select([port], [], [], SETTINGS_TIMEOUT_S)
     first, *later = port.receive() or [b""]
     settings = decode_to_guard(first) if first else None
