@@ -1,10 +1,11 @@
 """Child processes: logged, waited for with a deadline, always ended."""
 
 import os
+import random
 import socket
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import mavbridge
@@ -15,14 +16,31 @@ IMPORT_ROOT = Path(mavbridge.__file__).parents[1]
 """Folder that holds this mavbridge: the source tree, or site-packages."""
 END_TIMEOUT_S = 10.0
 LOG_LINES_QUOTED = 8
+PORTS_TO_GIVE = range(20_000, 32_768)
+"""Below those that Linux and macOS give to a socket that binds no port."""
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """Return a free UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback interface."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """Return a UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback interface, given only once.
+
+    Its number stays bound in the other protocol until this process ends, so that two processes
+    that ask at the same time get two ports. Raises ``UserError`` if no port is free.
+    """
+    claiming = socket.SOCK_STREAM if kind is socket.SOCK_DGRAM else socket.SOCK_DGRAM
+    for port in random.SystemRandom().sample(PORTS_TO_GIVE, k=len(PORTS_TO_GIVE)):
+        with (
+            socket.socket(socket.AF_INET, claiming) as claim,
+            socket.socket(socket.AF_INET, kind) as probe,
+            suppress(OSError),
+        ):
+            claim.bind(("127.0.0.1", port))
+            probe.bind(("127.0.0.1", port))
+            claim.detach()
+            return port
+    raise UserError(
+        f"none of the loopback ports {PORTS_TO_GIVE[0]} to {PORTS_TO_GIVE[-1]} is free: end what "
+        "uses them (ss -ulnpt names it)"
+    )
 
 
 def child_environment() -> dict[str, str]:

@@ -1,3 +1,4 @@
+import subprocess
 import sys
 from pathlib import Path
 
@@ -5,7 +6,7 @@ import pytest
 
 from mavbridge.core import processes
 from mavbridge.core.errors import UserError
-from mavbridge.core.processes import end, running, wait
+from mavbridge.core.processes import child_environment, end, free_port, running, wait
 
 pytestmark = pytest.mark.system
 DEAF = """
@@ -49,3 +50,22 @@ def test_a_child_imports_this_mavbridge_wherever_it_is_started(
     with running(sys.executable, "-c", program, log=log) as process:
         wait(process, "the child", log, 30)
     assert log.read_text().strip() == processes.mavbridge.__file__
+
+
+def test_no_port_is_given_twice_by_two_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = free_port()
+    ports = range(first, first + 8)
+    monkeypatch.setattr(processes, "PORTS_TO_GIVE", ports)
+    ours = {first, free_port(), free_port()}
+    asks = (
+        f"from mavbridge.core import processes\nprocesses.PORTS_TO_GIVE = {ports}\n"
+        "while True: print(processes.free_port(), flush=True)"
+    )
+    child = subprocess.run(
+        [sys.executable, "-c", asks], env=child_environment(), capture_output=True, text=True
+    )
+    theirs = {int(line) for line in child.stdout.split()}
+    assert len(ours) == 3
+    assert theirs
+    assert not theirs & ours
+    assert f"ports {ports[0]} to {ports[-1]} is free" in child.stderr
