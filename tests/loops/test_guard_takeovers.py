@@ -4,8 +4,10 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.guard_flights import GuardFlight, climbing_first
+from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.values import Phase
@@ -118,6 +120,20 @@ def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
 
 
 # --- who gets the sticks, and how
+
+
+def test_arm_reads_the_pilots_sticks_first_where_a_station_has_set_the_streams_before() -> None:
+    """RC_CHANNELS that comes before the calibration shows a receiver, but not its sticks."""
+    flight = GuardFlight(climbing_first, arm=True)
+    end = WireEnd(system=42, component=190)
+    for name in (dialect.MAVLINK_MSG_ID_RC_CHANNELS, dialect.MAVLINK_MSG_ID_SYS_STATUS):
+        interval = dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0, name, 500_000, 0, 0, 0, 0, 0
+        asked = end.pack(end.mav.command_long_encode(1, 1, *interval))
+        flight.vehicle.receive(0, asked, flight.clock.now_ns())
+    flight.take_off(2.5)
+    flight.act("release")
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=3)
+    assert flight.ap.mode is Mode.ALT_HOLD, flight.describe()
 
 
 @pytest.mark.parametrize("gap_s", [0.15, 1.0, 4.0])

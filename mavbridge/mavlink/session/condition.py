@@ -8,6 +8,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
+from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Body,
@@ -53,7 +54,8 @@ class VehicleCondition:
         self._changed_ns: int | None = None
         """Last change that CURRENT_MODE or an EVENT reported."""
         self._stick_override_ns: int | None = None
-        self.rc: tuple[int, RcChannels] | None = None
+        self._rc: tuple[int, RcChannels, RcCalibration | None] | None = None
+        """Arrival and body of the newest RC_CHANNELS, and the calibration that it was read by."""
         self._rc_sticks: Sticks | None = None
         self._pilot_sticks: Sticks | None = None
         self._newest: dict[type, tuple[int, Body]] = {}
@@ -129,7 +131,8 @@ class VehicleCondition:
             self._is_failsafe, self._changed_ns = True, arrived_ns
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
-        calibration, self.rc, self._rc_sticks = self._params.calibration, (arrived_ns, rc), None
+        calibration, self._rc_sticks = self._params.calibration, None
+        self._rc = arrived_ns, rc, calibration
         pwm_us = calibration.stick_channels_us(rc.channels_us) if calibration else None
         if calibration and pwm_us and all(pwm_us):
             self._rc_sticks = calibration.to_sticks(pwm_us)
@@ -163,8 +166,9 @@ class VehicleCondition:
         return self._system_bit(dialect.MAV_SYS_STATUS_PREARM_CHECK)
 
     def is_receiver_settled(self, now_ns: int) -> bool:
-        """True if both messages that show a receiver have arrived, or the wait for them is over."""
-        has_seen_radio = self.rc is not None and self._last(SystemStatus) is not None
+        """True if a receiver and its sticks would have been seen, or the wait for them is over."""
+        is_read = self._rc is not None and self._rc[2] == self._params.calibration
+        has_seen_radio = is_read and self._last(SystemStatus) is not None
         due_ns = self.receiver_due_ns
         return has_seen_radio or (due_ns is not None and now_ns >= due_ns)
 
@@ -197,7 +201,7 @@ class VehicleCondition:
         return self._status
 
     def _status_at(self, now_ns: int, has_receiver: bool | None) -> VehicleStatus:
-        rc_ns, rc = self.rc or (None, RcChannels(()))
+        rc_ns, rc, _ = self._rc or (None, RcChannels(()), None)
         is_shown = rc_ns is not None and now_ns - rc_ns <= GAP_NS
         is_valid = self._is_position_valid(now_ns)
         return VehicleStatus(
