@@ -227,11 +227,14 @@ class StreamRequester:
         if share is not None and self._scaled_windows >= _SCALED_WINDOWS:
             self._tell(share)
             return
+        # After a silence, or a reboot that ended all streams, the vehicle lacks nothing.
+        needed = [stream for stream in self._streams if stream.group.is_needed]
+        is_heard = share is None and not all(stream.is_slow(span_s) for stream in needed)
         for stream in self._streams:
             group, rate_hz = stream.group, stream.arriving_hz(span_s)
             is_rare = stream.is_settled and rate_hz <= _RARE * stream.rate_hz
             is_lacking = not stream.received or (is_rare and group.least_hz is None)
-            may_tell = share is None and stream.was_settled and not stream.is_absence_told
+            may_tell = is_heard and stream.was_settled and not stream.is_absence_told
             if group.without and is_lacking and may_tell:
                 stream.is_absence_told = True
                 comes = f"comes at {rate_hz:.1g} Hz" if stream.received else "does not come"

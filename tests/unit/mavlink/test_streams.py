@@ -247,6 +247,20 @@ def test_a_stream_that_is_granted_late_is_not_missed_before() -> None:
     assert link.texts == []
 
 
+def test_a_silence_of_the_whole_vehicle_is_told_as_no_lack_of_a_message() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=1e4)
+    for silent_s in (4.5, 6.0):
+        link.run(5.0)
+        link.silent = set(IDS.values())
+        link.run(silent_s)
+        link.silent = set()
+    link.run(5.0)
+    assert link.texts == []
+    link.silent = {IDS["SYS_STATUS"]}
+    link.run(8.0)
+    assert [text.partition(" does not come")[0] for text in link.texts] == ["SYS_STATUS"]
+
+
 @pytest.mark.parametrize(
     ("state_hz", "attitude_hz", "position_hz"),
     [(50, 50, 50), (100, 100, 100), (125, 125, 125), (200, 250, 125), (400, 250, 125)],
