@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.guard_facts import codes
 from helpers.guard_flights import GuardFlight, climbing_first, hovering
-from helpers.output_flights import OutputFlight
+from helpers.output_flights import HOVERING, OutputFlight
 from helpers.wire import WireEnd
 from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
@@ -88,6 +89,22 @@ def test_a_vehicle_of_any_release_is_flown_once_it_listens_to_us(
 
 
 # --- packets that do not pass
+
+
+def test_nothing_flies_before_the_message_that_shows_our_setpoints_is_granted() -> None:
+    """Else the first flight ended after a second for want of it, as the requests were lost."""
+    flight = OutputFlight("ardupilot", "velocity", HOVERING)
+    end, send, lost = WireEnd(), flight.up.send, []
+
+    def lose_three(data: bytes) -> None:
+        wanted = dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED
+        asked = [m for m in end.read(data) if getattr(m, "param1", None) == wanted]
+        lost.extend(asked)
+        if not asked or len(lost) > 3:
+            send(data)
+
+    flight.up.send = lose_three  # type: ignore[method-assign]
+    flight.fly(2.0)
 
 
 def refuse(flight: GuardFlight, *, is_refused: bool = True) -> None:

@@ -160,6 +160,10 @@ class StreamRequester:
             stream.received[name] += 1
             stream.newest_ns = arrived_ns
 
+    def has_settled(self, group: StreamGroup) -> bool:
+        """True if this group has been granted or given up."""
+        return self._by_message[group.messages[0]].has_settled
+
     def has_come(self, name: str) -> bool:
         """True if this message has come since it was wanted."""
         stream = self._by_message.get(name)

@@ -262,7 +262,8 @@ class VehicleSession:
         """Return the unfinished step of the set-up, or None."""
         if not self.params.is_read:
             return because(Code.READING_PARAMETERS)
-        if not self._streams.is_settled and self._streams.renewals == 0:
+        has_echo = self._echo is None or self._streams.has_settled(self._echo)
+        if not has_echo or (not self._streams.is_settled and self._streams.renewals == 0):
             return because(Code.REQUESTING_TELEMETRY)
         if not self.condition.is_receiver_settled(now_ns):
             return because(Code.LOOKING_FOR_RECEIVER)
