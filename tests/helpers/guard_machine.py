@@ -84,6 +84,8 @@ class Copter(FlownVehicle):
     is_failsafe = False
     switch_us = 1500
     """Pulse width of channel 7."""
+    radio_ns: int | None = None
+    """Last RC_CHANNELS; None: they come."""
 
     def use_output(self, output: Output) -> None:
         pass
@@ -96,7 +98,8 @@ class Copter(FlownVehicle):
             is_landed=False,
             has_receiver=self.has_receiver,
             pilot_sticks=NEUTRAL if self.has_receiver else None,
-            rc_channels_us=(1500,) * 6 + (self.switch_us, 1500),
+            rc_channels_us=() if self.radio_ns else (1500,) * 6 + (self.switch_us, 1500),
+            channels_arrived_ns=self.radio_ns,
             rc_arrived_ns=now_ns,
             is_position_valid=True,
             position_ned_m=(0.0, 0.0, -5.0),

@@ -12,6 +12,7 @@ from helpers.guard_machine import FLIGHT_MODES, GRACE_NS, LIMIT_NS, MS, STEP_NS,
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.switch import DWELL_NS
 from mavbridge.core.vehicle import Sticks
+from mavbridge.guard.table import UNSEEN_NS
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 ENDINGS = st.sampled_from(("auto", "release", "hold", "land", "rtl"))
@@ -149,7 +150,9 @@ class GuardMachine(RuleBasedStateMachine):
         """What takes some time to notice, and the end of everything."""
         world, now_ns = self.world, self.world.now_ns
         if world.phase is Phase.FLYING:
-            bounds = ((self.silent_ns, GRACE_NS + 2 * STEP_NS), (self.odd_ns, OVERRULED_NS))
+            bounds = [(self.silent_ns, GRACE_NS + 2 * STEP_NS), (self.odd_ns, OVERRULED_NS)]
+            if world.engage_channel is not None:
+                bounds.append((world.vehicle.radio_ns, UNSEEN_NS + 2 * STEP_NS))
             for since_ns, bound_ns in bounds:
                 assert since_ns is None or now_ns - since_ns <= bound_ns, "not noticed"
         if self.was_stopped_ns is not None and world.phase is not Phase.ENDED:
@@ -174,7 +177,7 @@ class GuardMachine(RuleBasedStateMachine):
             self.has_act = False
         self.step()
 
-    @precondition(lambda self: self.world.engage_channel is not None)
+    @precondition(lambda self: self.world.engage_channel and not self.world.vehicle.radio_ns)
     @rule(us=st.sampled_from((1000, 1500, 2000)))
     def turn_switch(self, us: int) -> None:
         self.world.vehicle.switch_us = us
@@ -183,6 +186,13 @@ class GuardMachine(RuleBasedStateMachine):
         self.must_end = us == 1000
         if us != 1500:
             self.switch_is_low = us == 1000
+        self.step()
+
+    @rule(is_lost=st.booleans())
+    def lose_radio(self, is_lost: bool) -> None:
+        """RC_CHANNELS stops or comes again; for its echo of our sticks see `change_radio`."""
+        now_ns = self.world.vehicle.radio_ns or self.world.now_ns
+        self.world.vehicle.radio_ns = now_ns if is_lost else None
         self.step()
 
     @rule(is_off=st.booleans())
@@ -348,6 +358,7 @@ class GuardMachine(RuleBasedStateMachine):
         world.vehicle.is_failsafe = world.is_switched_off = False
         world.link_problem = world.refused_mode = None
         world.hears = world.shows = True
+        world.vehicle.radio_ns = None
         world.joystick_ns, self.odd_ns = 0, None
         if self.was_stopped_ns is None:
             world.has_chunks, self.silent_ns = True, None
