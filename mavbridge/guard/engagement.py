@@ -133,6 +133,8 @@ class Engagement(Memory):
     def _watch(self, now: EngagementInputs) -> Actions:
         """Read-only: run the policy whenever it could fly; the link sends nothing."""
         if (cause := self.end_request or duration_over(self, now)) is not None:
+            if self.outcome.flights:
+                self.phase = Phase.FLYING  # also if the policy could not fly at the end
             self._note_end(cause)
             self.phase, self.reason = Phase.ENDED, cause.reason
             return Actions()

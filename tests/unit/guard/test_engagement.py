@@ -328,9 +328,12 @@ def test_a_vehicle_that_is_silent_from_the_start_is_no_error() -> None:
 
 
 @pytest.mark.parametrize("ends", ["stop", "duration"])
-def test_watching_ends_as_a_flight_does(ends: str) -> None:
+@pytest.mark.parametrize("at_last", [FLIES, NOTHING])
+def test_watching_ends_as_a_flight_does(ends: str, at_last: Actions) -> None:
     stepped = Stepped(readonly=True, duration_ns=NS_PER_S if ends == "duration" else None)
-    assert set(stepped.run(1)) == {FLIES}
+    assert set(stepped.run(0.9)) == {FLIES}
+    late = None if at_last == FLIES else because(Code.NO_IMAGE)
+    assert set(stepped.run(0.1, chunk_problem=late)) == {at_last}
     assert stepped.step(stop=DEATH if ends == "stop" else None) == NOTHING
     assert stepped.phase is Phase.ENDED
     assert stepped.engagement.outcome.end == ("fault" if ends == "stop" else ends)
