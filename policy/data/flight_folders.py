@@ -20,7 +20,7 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.flight_video import decode_images, video_parts, with_images
-from policy.data.tables import number_column, read_rows, stamps, vectors
+from policy.data.tables import number_column, read_rows, retyped, stamps, vectors
 from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
@@ -33,6 +33,9 @@ _TICK_COLUMNS = (
     *("sent", "rc_sticks", "armed", "phase", "mode"),
 )
 _FRAME_COLUMNS = ("captured_ns",)
+_INTEGERS = (*_AGE_COLUMNS, *_FRAME_COLUMNS, "sent_ns", "attitude_ns", "velocity_ns")
+_WORDS = dict.fromkeys(("phase", "mode"), pa.string())
+_TYPES = dict.fromkeys(_INTEGERS, pa.int64()) | _WORDS | {"armed": pa.bool_()}
 
 
 def find_flights(paths: Sequence[Path]) -> list[Path]:
@@ -324,6 +327,8 @@ def _read_table(
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
     if table.num_rows == 0 and stem == "ticks":
         raise DatasetError(f"{folder}: no ticks: nothing was flown")
+    for column in filter(_TYPES.__contains__, columns):
+        table = retyped(f"{folder}, {stem}", table, column, _TYPES[column])
     return table, numbers
 
 

@@ -25,7 +25,17 @@ _LABELS = (
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
     """Return a column of integers without nulls."""
-    return number_column(name, table, column).astype(np.int64)
+    return number_column(name, retyped(name, table, column, pa.int64()), column).copy()
+
+
+def retyped(name: str, table: pa.Table, column: str, kind: pa.DataType) -> pa.Table:
+    """Return the table with a column of this type; raise DatasetError if a value does not fit."""
+    try:
+        values = table[column].cast(kind)
+    except pa.ArrowException as error:
+        kinds = f"{kind}, not {table[column].type}"
+        raise DatasetError(f"{name}: {column} must hold {kinds} ({error})") from error
+    return table.set_column(table.column_names.index(column), column, values)
 
 
 def number_column(name: str, table: pa.Table, column: str) -> np.ndarray:
