@@ -166,8 +166,17 @@ class ImagineConfig(Ranged):
     """Let the world model decide from its latents, without decoding and encoding them again."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
+        """Refuse values out of range, and settings that the decider ignores."""
         super().__post_init__()
+        ignored = self.policy.given("device", "seed")
+        if self.decider == "toge":
+            ignored = ["fast_policy_no_decode"] * self.fast_policy_no_decode
+        if ignored:
+            other = "toge" if self.decider == "world-model" else "world-model"
+            names = ", ".join(ignored).replace("_", " ")
+            raise UserError(
+                f"{names}: not of --decider {self.decider}; add --decider {other}, or leave it out"
+            )
         if self.frames is not None and self.exe_steps > self.frames:
             raise UserError(
                 f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "

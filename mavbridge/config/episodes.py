@@ -1,6 +1,6 @@
 """Settings of the commands that fly simulated episodes, and the seeds of their courses."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -152,9 +152,7 @@ class DemonstrateConfig(Ranged):
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         if self.policy.dual_rate is False:
             raise UserError("demonstrations are flown at two rates: leave out --single-rate")
-        students = [each for each in fields(PolicyConfig) if each.name not in _EXPERTS]
-        given = [each.name for each in students if getattr(self.policy, each.name) != each.default]
-        given += ["solve_time"] if self.solve_time else []
+        given = self.policy.given(*_EXPERTS) + ["solve_time"] * bool(self.solve_time)
         if self.policy.checkpoint is None and given:
             names = ", ".join(given).replace("_", " ")
             raise UserError(

@@ -1,6 +1,6 @@
 """Settings of a policy, shared by every command that flies one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -47,6 +47,14 @@ class PolicyConfig(Ranged):
     """torch device: cpu, cuda, cuda:1, mps."""
     seed: Annotated[int, Parameter(group=RARE), Between(0, 2**63 - 1)] = 0
     """Seed of random weights, diffusion noise and simulated courses."""
+
+    def given(self, *apart: str) -> list[str]:
+        """Return the names of the settings that were changed, apart from these."""
+        return [
+            each.name
+            for each in fields(self)
+            if each.name not in apart and getattr(self, each.name) != each.default
+        ]
 
     @property
     def kind(self) -> str:

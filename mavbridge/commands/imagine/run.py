@@ -1,7 +1,6 @@
 """``mavbridge imagine``: from a recorded flight and the settings to the files of a rollout."""
 
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,6 @@ from mavbridge.commands.imagine.loop import (
 )
 from mavbridge.commands.imagine.output import StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
-from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
@@ -125,16 +123,8 @@ def _make_decider(
     config: ImagineConfig, sampler: Sampler, console: Console, stack: ExitStack
 ) -> Decider:
     if config.decider == "world-model":
-        named = {"checkpoint": config.policy.checkpoint, "policy": config.policy.policy}
-        for flag, value in named.items():
-            if value != getattr(PolicyConfig, flag):
-                raise UserError(
-                    f"--{flag} {value} is of a policy, and the world model decides: add "
-                    "--decider toge, or leave it out"
-                )
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
-    wanted = replace(config.policy, dual_rate=True)
-    loaded = stack.enter_context(load_configured_policy(wanted, MonotonicClock()))
+    loaded = stack.enter_context(load_configured_policy(config.policy, MonotonicClock()))
     for note in loaded.notes:
         console.print(note, style="yellow" if isinstance(note, Warned) else "dim")
     return PolicyDecider(loaded.runner, sampler)

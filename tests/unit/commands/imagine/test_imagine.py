@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from helpers.recordings import count_frames
 from helpers.rollouts import TinyWorld, read_rows, write_flight
 from helpers.status import status_of, told_by
 from mavbridge.commands.imagine import run
-from mavbridge.commands.imagine.loop import Sampler
+from mavbridge.commands.imagine.loop import PolicyDecider, Sampler
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.video.file import read_video
@@ -101,6 +102,21 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     left = text.split("is readable in ")[1].split()[::2]
     assert left[-1].endswith("a.arrows")
     assert all(Path(name).exists() for name in left)
+
+
+@pytest.mark.parametrize("rate", ["--single-rate", "--dual-rate"])
+def test_the_rate_is_obeyed(imagine: Imagine, monkeypatch: pytest.MonkeyPatch, rate: str) -> None:
+    flown: list[bool] = []
+    decide = PolicyDecider.decide
+
+    def seen(self: PolicyDecider, *arguments: Any) -> Any:
+        flown.append(self._runner.dual_rate)
+        return decide(self, *arguments)
+
+    monkeypatch.setattr(PolicyDecider, "decide", seen)
+    status, text = imagine("--decider", "toge", "--policy", "scripted", "--n-iter", "1", rate)
+    assert status == 0, text
+    assert flown == [rate == "--dual-rate"]
 
 
 ROOT = Path(__file__).parents[4]
