@@ -31,6 +31,7 @@ MAX_EPISODES = 10_000
 """Most episodes per evaluation, so that different seeds never share courses."""
 _EXPERTS = ("seed", "image_size", "dual_rate")
 """Settings of a policy that a demonstration uses without a student, or checks itself."""
+_NETWORKS = ("toge", "toge-rates", "resnet-unet")
 
 MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
 """Beyond this seed, easy courses would be race courses, some of them trained on."""
@@ -138,12 +139,11 @@ class DemonstrateConfig(Ranged):
     max_time: Annotated[float, Between(1, 3600, "s")] = 40.0
     """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
-    labels (DAgger)."""
+    """Student: with --checkpoint, or if it needs none (lerobot:DIR), it flies most of the time, and
+    the expert's actions are recorded as labels (DAgger)."""
     solve_time: Annotated[float, Between(0, 1000, "ms")] = 0.0
-    """With --checkpoint: longest time for a chunk, in milliseconds. The policy then flies as one
-    with a slow head or behind a server does; each flight draws its own time, from a quarter of this
-    on."""
+    """Longest time for a student's chunk, in milliseconds. It then flies as a policy with a slow
+    head or behind a server does; each flight draws its own time, from a quarter of this on."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
@@ -153,13 +153,18 @@ class DemonstrateConfig(Ranged):
         if self.policy.dual_rate is False:
             raise UserError("demonstrations are flown at two rates: leave out --single-rate")
         given = self.policy.given(*_EXPERTS) + ["solve_time"] * bool(self.solve_time)
-        if self.policy.checkpoint is None and given:
+        if not self.has_student and given:
             names = ", ".join(given).replace("_", " ")
             raise UserError(
                 f"{names}: the expert has none; give the student's --checkpoint, or leave it out "
                 "(the expert flies by rates with --action rates)"
             )
         check_range("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")
+
+    @property
+    def has_student(self) -> bool:
+        """True if a policy flies; a built-in network needs ``checkpoint`` for that."""
+        return self.policy.checkpoint is not None or self.policy.kind not in _NETWORKS
 
     @property
     def first_course_seed(self) -> int:

@@ -96,7 +96,7 @@ def _terms(
 ) -> tuple[Contract, PolicyRunner | None]:
     """Return the contract of the flight and the student, if one flies; ``stack`` closes it."""
     wanted = config.policy
-    if wanted.checkpoint is None:
+    if not config.has_student:
         size_px = wanted.image_size or SIM_CAMERA_PX
         contract = Contract(
             feature_dim=1,
@@ -112,7 +112,8 @@ def _terms(
     student = stack.enter_context(loaded).runner
     if student.contract.action != config.action:
         action = student.contract.action
-        raise UserError(f"{wanted.checkpoint} flies by {action}: use --action {action}")
+        name = wanted.checkpoint or wanted.policy
+        raise UserError(f"{name} flies by {action}, and the expert by {config.action} (--action)")
     max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
     contract = replace(student.contract, max_feature_age_s=max_age_s, stops_at_end=True)
     return contract, replace(student, contract=contract)
@@ -125,12 +126,12 @@ def _meta(
         started_at=datetime.now(UTC).isoformat(),
         start_ns=start_ns,
         mavbridge_version=mavbridge.__version__,
-        source="dagger" if spec.config.policy.checkpoint else "demonstration",
+        source="dagger" if spec.config.has_student else "demonstration",
         policy=runner.name,
         engine=runner.engine,
-        mode="dual",
+        mode="dual" if runner.dual_rate else "single",
         autopilot=spec.config.autopilot,
-        action_hz=Rates().loops(is_dual=True).action_hz,
+        action_hz=Rates().loops(is_dual=runner.dual_rate).action_hz,
         visual_hz=Rates().visual_rate,
         contract=runner.contract,
         course_seed=spec.seed,
@@ -213,7 +214,7 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
         UserError: the folder of an episode holds another flight, or something else.
         FlightError: the folder of an episode holds a meta.json that is damaged or not ours.
     """
-    weights = digests(policy_files(config.policy)) if config.policy.checkpoint else {}
+    weights = digests(policy_files(config.policy)) if config.has_student else {}
     specs = []
     for index in range(config.episodes):
         folder, seed = config.out / f"{index:06d}", config.first_course_seed + index
@@ -236,7 +237,7 @@ def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
     """Return how a recorded flight differs from the one to fly, in words; empty if it does not."""
     config = spec.config
     pairs = {
-        "source": (meta.source, "dagger" if config.policy.checkpoint else "demonstration"),
+        "source": (meta.source, "dagger" if config.has_student else "demonstration"),
         "course seed": (meta.course_seed, spec.seed),
         "--autopilot": (meta.autopilot, config.autopilot),
         "--action": (meta.contract and meta.contract.action, config.action),

@@ -164,6 +164,28 @@ def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Pat
     assert ticks["expert"].null_count == 0
 
 
+STUDENT = """
+from numpy import zeros
+from policy.contract import Contract
+class Single:
+    contract = Contract(arrays="numpy")
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return zeros((1, self.contract.horizon, 4), "f4")
+"""
+
+
+def test_a_student_without_a_checkpoint_flies(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(STUDENT)
+    spec = f"{tmp_path}/mine.py:Single"
+    assert (
+        demonstrate(replace(config(tmp_path / "a", max_time=1.0), policy=PolicyConfig(policy=spec)))
+        == 0
+    )
+    meta = open_flight(tmp_path / "a/000000").meta
+    assert (meta.source, meta.policy, meta.mode, meta.action_hz) == ("dagger", spec, "single", 30)
+    assert list(meta.policy_files) == [f"{tmp_path}/mine.py"]
+
+
 def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> None:
     def flown(seed: int) -> list[bool]:
         turns = TurnSchedule(seed)
@@ -210,5 +232,5 @@ def test_a_student_is_flown_by_what_it_was_trained_for(tmp_path: Path) -> None:
     student = replace(
         by_rates, policy=replace(by_rates.policy, image_size=None, checkpoint=SHIPPED)
     )
-    with pytest.raises(UserError, match="flies by sticks: use --action sticks"):
+    with pytest.raises(UserError, match=r"flies by sticks, and the expert by rates \(--action\)"):
         demonstrate(student)
