@@ -7,13 +7,22 @@ import copy
 import hashlib
 import re
 import sys
-from collections import deque
+from collections import UserDict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from gc import get_referents
 from io import IOBase
 from itertools import count, islice
-from types import MemberDescriptorType, SimpleNamespace
+from queue import Queue
+from types import (
+    CellType,
+    CodeType,
+    FunctionType,
+    MemberDescriptorType,
+    MethodType,
+    ModuleType,
+    SimpleNamespace,
+)
 
 import numpy as np
 import torch
@@ -28,10 +37,12 @@ WARM_UP_CALLS = 3
 """Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
 MAX_HELD = 10_000
 """Largest number of objects that are searched for a policy's modules and memory."""
-_COLLECTIONS = (list, tuple, dict, set, frozenset, deque, partial)
-_OPENED = (*_COLLECTIONS, SimpleNamespace, nn.Module)
+_WRAPPERS = (partial, MethodType, CellType, staticmethod, classmethod, property)
+_COLLECTIONS = (list, tuple, dict, set, frozenset, deque, *_WRAPPERS)
+_OPENED = (*_COLLECTIONS, SimpleNamespace, UserDict, Queue, nn.Module)
 """Types that are searched beside those of packages outside ``_LIBRARIES``."""
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
+_OURS = ("policy", "mavbridge")
 _OF_TORCH = frozenset(vars(nn.Module()))
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
@@ -149,7 +160,7 @@ def _held_by(policy: object) -> list[tuple[str, object, dict[str, object]]]:
     held, seen = [("", policy, _attributes(policy))], {id(policy)}
     for path, _, inside in held:  # grows
         for name, value in inside.items():
-            is_open = isinstance(value, _OPENED) or _is_of_user(type(value))
+            is_open = isinstance(value, _OPENED) or _is_of_user(type(value)) or _is_code(value)
             if is_open and id(value) not in seen and len(held) < MAX_HELD:
                 seen.add(id(value))
                 held.append((path + name, value, _attributes(value)))
@@ -160,20 +171,50 @@ def _is_of_user(kind: type) -> bool:
     return kind.__module__.partition(".")[0] not in _LIBRARIES
 
 
+def _is_code(value: object) -> bool:
+    """True for a function, class or module of the user's, rather than of an installed package."""
+    if not isinstance(value, FunctionType | type | ModuleType):
+        return False
+    name = str(getattr(value, "__module__", None) or value.__name__)
+    file = getattr(sys.modules.get(name), "__file__", None) or ""
+    is_library = name.partition(".")[0] in (*_LIBRARIES, *_OURS) or "site-packages" in file
+    return not is_library
+
+
+def _reached(function: FunctionType) -> dict[str, object]:
+    """Return the globals, cells and defaults that a function reads or writes, by their names."""
+    codes, names = [function.__code__], set[str]()
+    for code in codes:  # grows by the functions inside
+        names.update(code.co_names)
+        codes += [each for each in code.co_consts if isinstance(each, CodeType)]
+    reached = {name: each for name, each in function.__globals__.items() if name in names}
+    code = function.__code__
+    arguments = reversed(code.co_varnames[: code.co_argcount])
+    reached |= dict(zip(arguments, reversed(function.__defaults__ or ()), strict=False))
+    cells = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
+    return reached | cells | (function.__kwdefaults__ or {})
+
+
 def _attributes(holder: object) -> dict[str, object]:
     """Return the elements of a collection, and the attributes of an object and of its class."""
     items: Iterable[tuple[object, object]] = ()
     if isinstance(holder, _COLLECTIONS):
         items = holder.items() if isinstance(holder, dict) else enumerate(get_referents(holder))
     elements = {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
-    attributes: dict[str, object] = {}
-    for kind in filter(_is_of_user, reversed(type(holder).__mro__)):
+    attributes = _reached(holder) if isinstance(holder, FunctionType) else {}
+    kinds = holder.__mro__ if isinstance(holder, type) else type(holder).__mro__
+    for kind in filter(_is_of_user, reversed(kinds)):
         attributes |= vars(kind)
     slots = [name for name, each in attributes.items() if isinstance(each, MemberDescriptorType)]
     attributes |= {name: getattr(holder, name, None) for name in slots}
     attributes |= getattr(holder, "__dict__", {})
     if isinstance(holder, nn.Module):
-        attributes = {name: each for name, each in attributes.items() if name not in _OF_TORCH}
+        is_script = isinstance(holder, torch.jit.ScriptModule)  # holds methods of its original, too
+        attributes = {
+            name: each
+            for name, each in attributes.items()
+            if name not in _OF_TORCH and not (is_script and isinstance(each, MethodType))
+        }
         attributes |= {**dict(holder.named_buffers(recurse=False)), **dict(holder.named_children())}
     return elements | {f".{name}": value for name, value in attributes.items()}
 
@@ -195,6 +236,8 @@ def _mark(value: object) -> object:
         return value
     if isinstance(value, float | count):
         return repr(value)  # NaN equals itself; a counter tells its next number
+    if isinstance(value, bytearray):
+        return bytes(value)
     if isinstance(value, dict):
         return tuple((id(key), id(element)) for key, element in value.items())
     if isinstance(value, list | tuple | set | frozenset | deque):

@@ -2,6 +2,7 @@
 
 import itertools
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
@@ -147,6 +148,51 @@ class CountingInSlots(CountingBelow):
     def __init__(self) -> None:
         super().__init__()
         self.phases: Any = deque([Phase()])
+
+
+class CountingBy(TwoRates):
+    """Its memory is wherever a function has it."""
+
+    def __init__(self, count: Callable[[], object]) -> None:
+        super().__init__()
+        self.count = count
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        self.count()
+        return super().predict_fast(feature, state, history, steps)
+
+
+COUNTED = Phase()
+
+
+def count_in_global() -> None:
+    COUNTED.calls += 1
+
+
+def count_in_default(calls: list[int] = [0]) -> None:  # noqa: B006 - a usual place for a memory
+    calls[0] += 1
+
+
+def count_in_attribute() -> None:
+    vars(count_in_attribute)["calls"] = vars(count_in_attribute).get("calls", 0) + 1
+
+
+def counter_in_closure() -> Callable[[], None]:
+    calls = 0
+
+    def count() -> None:
+        nonlocal calls
+        calls += 1
+
+    return count
+
+
+class Counter:
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def count(self) -> None:
+        self.calls += 1
 
 
 class Deciding(TwoRates):

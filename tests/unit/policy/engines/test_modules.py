@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from torch import nn
 
 from helpers import torch_policies
-from helpers.torch_policies import TwoRates
+from helpers.torch_policies import Counter, TwoRates
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
 from policy.engines.choose import (
@@ -65,6 +66,23 @@ def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason,
     assert logging.root.level == level  # the converter raises it
     assert notes
     assert all(re.search(reason, note) for note in notes)
+
+
+@pytest.mark.parametrize(
+    "count",
+    [
+        *(torch_policies.count_in_global, torch_policies.count_in_default),
+        *(torch_policies.count_in_attribute, torch_policies.counter_in_closure()),
+        *(
+            torch_policies.Counter().count,
+            partial(torch_policies.Counter.count, torch_policies.Counter()),
+        ),
+    ],
+)
+def test_a_memory_behind_functions_is_found(count: Callable[[], object]) -> None:
+    runner, notes = choose_runner(torch_policies.CountingBy(count), "auto", SETTINGS)
+    assert runner.engine == "torch"
+    assert notes == ("engine torch: it keeps calls from call to call, which a graph cannot",)
 
 
 def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
