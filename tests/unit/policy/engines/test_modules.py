@@ -74,8 +74,8 @@ def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason,
         *(torch_policies.count_in_global, torch_policies.count_in_default),
         *(torch_policies.count_in_attribute, torch_policies.counter_in_closure()),
         *(
-            torch_policies.Counter().count,
-            partial(torch_policies.Counter.count, torch_policies.Counter()),
+            Counter().count,
+            partial(Counter.count, Counter()),
         ),
     ],
 )
