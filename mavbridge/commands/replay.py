@@ -31,7 +31,7 @@ from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.policies import is_scripted, load_configured_policy
+from mavbridge.flight.policies import is_scripted, is_stateless, load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.simulation.clock import SteppedClock
@@ -43,6 +43,7 @@ from mavbridge.simulation.replay.compare import (
     StickTraces,
     compare_guard,
     compare_policy,
+    forgotten,
     guard_traces,
     other_traces,
 )
@@ -55,7 +56,7 @@ from mavbridge.simulation.replay.guard import (
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
 from policy.errors import NoChunkError
-from policy.protocol import PolicyRunner
+from policy.protocol import PolicyRunner, keep_nothing
 
 VIDEO_TOLERANCE = 0.15
 """Tolerance of a smoothed stick for the lossy video, in full deflections: twice the measured
@@ -99,8 +100,8 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             for pair in pairs
             if pair.replayed is not None
         }
-    is_same = compared is None or compared.equal_chunks == compared.solves
     traces = guard_traces(steps)
+    is_same = compared is None or compared.equal_chunks == compared.solves
     if wanted.limits != source.config.limits or not is_same:
         traces = other_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
@@ -118,6 +119,9 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             config, source.config, wanted, chosen, is_same_engine=engine == source.meta.engine
         ),
     )
+    if compared and result.problems and not is_stateless(wanted.policy):
+        told = forgotten(compared, has_reset=runner.reset is not keep_nothing)
+        result = replace(result, source=replace(source, gaps=(*source.gaps, *told)))
     print_replay(result, table_console())
     # JSON lacks infinity: only one of the two was flown.
     document = json.loads(json.dumps(as_document(result)), parse_constant=lambda _: None)
@@ -296,9 +300,8 @@ class ReplayResult:
             if other and self.tolerance == 0:
                 found.append(f"{other} of {policy.solves} chunks differ")
         if self.sticks.deviation.most > self.tolerance:
-            found.append(
-                f"a stick is off by {self.sticks.deviation.most:.4g}, more than {self.tolerance:g}"
-            )
+            most = self.sticks.deviation.most
+            found.append(f"a stick is off by {most:.4g}, more than {self.tolerance:g}")
         return tuple(found)
 
     @property
@@ -321,18 +324,16 @@ def print_replay(result: ReplayResult, console: Console) -> None:
         moved = result.sticks.deviation
         rows.append(_row("sticks, these chunks and limits", "", moved))
         rows.append(_row("the same, rms", "", Deviation(largest=moved.rms, rms=moved.rms)))
-    title = f"replay of {result.source.folder} from {result.chosen}"
-    header = ["largest difference", "equal", *names]
-    console.print(make_table(title, header, rows, left_columns=2))
+    title, header = f"replay of {result.source.folder} from {result.chosen}", "largest difference"
+    console.print(make_table(title, [header, "equal", *names], rows, left_columns=2))
     recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
     console.print(recorded + (f", replayed on {result.engine}" if result.engine else ""))
     for gap in result.source.gaps:
         console.print(f"note: {gap}", style="yellow")
     past = result.policy.inputs_differ if result.policy and result.tolerance is not None else {}
-    for name in PAST_INPUTS:
-        if name in past:
-            note = f"{name} of {past[name]} solves are the recorded ones: built anew, they differ"
-            console.print(f"note: {note}", style="yellow")
+    for name in filter(past.get, PAST_INPUTS):
+        note = f"{name} of {past[name]} solves are the recorded ones: built anew, they differ"
+        console.print(f"note: {note}", style="yellow")
     for problem in result.problems:
         console.print(f"different: {problem}", style="red")
     console.print(_verdict(result), style="bold")

@@ -1,7 +1,7 @@
 """Comparison of a replay with the recording, bit for bit."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -122,6 +122,16 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
         equal_chunks=equal,
         deviation=deviation_of(np.concatenate([np.zeros((0, 4)), *differences])),
     )
+
+
+def forgotten(compared: PolicyComparison, *, has_reset: bool) -> Iterator[str]:
+    """Yield why the flown policy may have decided differently in its repetition."""
+    if compared.equal_chunks == compared.solves:
+        return
+    if not has_reset:
+        yield "the policy has no reset, so what it kept from earlier calls is not repeated"
+    if compared.missing:
+        yield "a solve without a chunk is not recorded, nor what a policy kept from it"
 
 
 def _inputs(solve: Solve) -> dict[str, object]:

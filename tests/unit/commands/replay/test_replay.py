@@ -2,7 +2,9 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -152,4 +154,37 @@ def test_what_the_replay_cannot_repeat_is_told_with_the_verdict(
 
     shown = " ".join(capsys.readouterr().out.split())
     assert f"senders of packets, so this is not repeated: {moved}" in shown
+    assert "NOT EQUAL, perhaps for the notes above" in shown
+
+
+class Counting:
+    """Keeps a count, and has no reset."""
+
+    def __init__(self) -> None:
+        self.contract = golden("numpy_px4").contract
+        self._calls = 0
+
+    def encode_visual(self, image: np.ndarray) -> np.ndarray:
+        return np.zeros((1, 4), np.float32)
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        self._calls += 1
+        return np.full((1, 8, 4), 0.01 * self._calls % 0.3, np.float32)
+
+
+def test_a_memory_that_is_not_repeated_is_told_with_the_verdict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = copied("numpy_px4", tmp_path)
+    flown = f"{__file__}:Counting"
+    for name in (SETTINGS, "meta.json"):
+        document = json.loads((folder / name).read_text())
+        settings = document["config"]["policy"] if name == SETTINGS else document
+        settings["policy"] = flown
+        (folder / name).write_text(json.dumps(document))
+
+    assert replay(folder, ReplayConfig(policy=flown)) == ExitCode.DIFFERENT
+
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "the policy has no reset, so what it kept from earlier calls is not repeated" in shown
     assert "NOT EQUAL, perhaps for the notes above" in shown
