@@ -84,7 +84,7 @@ TICKS = pa.schema(
         pa.field("armed", pa.bool_(), nullable=False),
         pa.field("texts", pa.list_(pa.string()), nullable=False),
         pa.field("dropped_before", pa.int32(), nullable=False),
-        *_fields(pa.bool_(), "is_slot", "is_coasting"),
+        *_fields(pa.bool_(), "is_slot", "is_coasting", nullable=False),
         *_fields(pa.int64(), "chunk_serial", "chunk_computed_ns"),
         pa.field("phase", pa.string()),
         pa.field("position_ned_m", _VECTOR),
@@ -157,7 +157,14 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
     """Return the records of a table of ticks whose actions are of this kind.
 
     Whole columns are never converted to Python objects at once.
+
+    Raises:
+        FlightError: a part of a state or of an action is missing.
     """
+    for whole, parts in (("state", STATE_STAMPS), ("raw", ActionTrace._fields)):
+        there = table.filter(table[whole].is_valid())
+        if torn := [name for name in parts if there[name].null_count]:
+            raise FlightError(f"ticks have {whole} without {', '.join(torn)}: see docs/formats.md")
     serial, make = -1, ACTION_CLASSES[action]
     readonly = table.column("sent").null_count == table.num_rows
     for row in _rows(table):

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -18,6 +19,7 @@ Row: TypeAlias = dict[str, object]
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash can lose."""
 READ_ERRORS = (pa.ArrowException, OSError)
+_ADVICE = "another program or version wrote it"
 _GROUP_ROWS = 2_048
 """Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
 
@@ -131,6 +133,12 @@ def read_numbered(
     if missing:
         raise DatasetError(
             f"the table {stem} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            "of docs/formats.md: another program or version wrote it"
+            f"of docs/formats.md: {_ADVICE}"
         )
+    for field in schema:
+        column = table[field.name]
+        is_list = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
+        nulls = pc.list_flatten(column).null_count if is_list else 0
+        if nulls or (column.null_count and not field.nullable):
+            raise DatasetError(f"the table {stem} holds null in {field.name}: {_ADVICE}")
     return table, numbers

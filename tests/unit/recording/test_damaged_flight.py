@@ -5,6 +5,7 @@ import shutil
 from functools import partial
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -13,6 +14,8 @@ from helpers.recordings import make_frame, number_of, write_recording
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.meta import FlightError
+from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight
 from policy.data.flight_video import video_parts
 
@@ -105,3 +108,21 @@ def test_inspect_says_so(flight: Path, capsys: pytest.CaptureFixture[str]) -> No
         assert any(f"{name} is damaged" in text for text in document["damage"])
     assert [moment["what"] for moment in document["moments"]] == ["rows lost"]
     assert "damage" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        *((name, f"holds null in {name}") for name in ("due_ns", "texts", "is_coasting")),
+        *(("rate_ns", "state without rate_ns"), ("slewed", "raw without slewed")),
+        ("sent", "holds null in sent"),
+    ],
+)
+def test_a_value_that_every_row_has_is_missed(flight: Path, column: str, said: str) -> None:
+    table = pq.read_table(flight / "ticks.parquet")
+    null = [None] * 4 if column == "sent" else None
+    values = pa.array([null] * table.num_rows, table.schema.field(column).type)
+    place = table.column_names.index(column)
+    pq.write_table(table.set_column(place, column, values), flight / "ticks.parquet")
+    with pytest.raises((DatasetError, FlightError), match=said):
+        inspect((flight,), InspectConfig())
