@@ -211,7 +211,7 @@ def stray_lines_shown(show: Callable[[str], None], console: IO[str]) -> Iterator
 def _is_same_file(stream: TextIO | None, other: IO[str]) -> bool:
     try:
         return stream is not None and os.path.sameopenfile(stream.fileno(), other.fileno())
-    except (OSError, ValueError):  # closed, or a buffer in memory
+    except (OSError, ValueError, AttributeError):  # closed, in memory, or a policy's own stream
         return False
 
 

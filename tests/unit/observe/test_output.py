@@ -6,6 +6,7 @@ Whole flights of such a console are in tests/faults/catalogue: terminal-stalled,
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -66,3 +67,13 @@ def test_what_is_printed_to_the_file_of_the_console_becomes_messages(
     assert shown == ["one", "two", 3000 * "x", *own, "its last words", "afterwards"]
     elsewhere = (tmp_path / "out").read_text() + (tmp_path / "err").read_text()
     assert elsewhere == "".join(f"to {name}\n" for name in others)
+
+
+def test_a_stream_of_a_policy_that_is_no_file_keeps_its_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[str] = []
+    monkeypatch.setattr(sys, "stdout", SimpleNamespace(write=kept.append, flush=lambda: None))
+    with (tmp_path / "console").open("w") as console, stray_lines_shown(pytest.fail, console):
+        print("mine")
+    assert kept == ["mine", "\n"]
