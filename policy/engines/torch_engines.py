@@ -208,6 +208,8 @@ def _attributes(holder: object) -> dict[str, object]:
     slots = [name for name, each in attributes.items() if isinstance(each, MemberDescriptorType)]
     attributes |= {name: getattr(holder, name, None) for name in slots}
     attributes |= getattr(holder, "__dict__", {})
+    if isinstance(holder, ModuleType):  # Python itself writes into __warningregistry__
+        attributes = {name: each for name, each in attributes.items() if not name.startswith("__")}
     if isinstance(holder, nn.Module):
         is_script = isinstance(holder, torch.jit.ScriptModule)  # holds methods of its original, too
         attributes = {

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,11 +162,19 @@ class CountingBy(TwoRates):
         return super().predict_fast(feature, state, history, steps)
 
 
-COUNTED = Phase()
+COUNTED, MODULE = Phase(), ModuleType("counted")
 
 
 def count_in_global() -> None:
     COUNTED.calls += 1
+
+
+def count_in_module() -> None:
+    vars(MODULE)["calls"] = vars(MODULE).get("calls", 0) + 1
+
+
+def warn_in_module() -> None:
+    vars(MODULE)["__warningregistry__"] = {"version": object()}
 
 
 def count_in_default(calls: list[int] = [0]) -> None:  # noqa: B006 - a usual place for a memory

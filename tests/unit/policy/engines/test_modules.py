@@ -72,6 +72,7 @@ def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason,
     "count",
     [
         *(torch_policies.count_in_global, torch_policies.count_in_default),
+        torch_policies.count_in_module,
         *(torch_policies.count_in_attribute, torch_policies.counter_in_closure()),
         *(
             Counter().count,
@@ -83,6 +84,11 @@ def test_a_memory_behind_functions_is_found(count: Callable[[], object]) -> None
     runner, notes = choose_runner(torch_policies.CountingBy(count), "auto", SETTINGS)
     assert runner.engine == "torch"
     assert notes == ("engine torch: it keeps calls from call to call, which a graph cannot",)
+
+
+def test_what_python_keeps_in_a_module_is_no_memory() -> None:
+    policy = torch_policies.CountingBy(torch_policies.warn_in_module)
+    assert choose_runner(policy, "auto", SETTINGS)[0].engine.startswith("openvino")
 
 
 def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
