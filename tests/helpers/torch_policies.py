@@ -174,7 +174,8 @@ def count_in_module() -> None:
 
 
 def warn_in_module() -> None:
-    vars(MODULE)["__warningregistry__"] = {"version": object()}
+    registry = vars(MODULE).setdefault("__warningregistry__", {})
+    registry["version"] = registry.get("version", 0) + 1
 
 
 def count_in_default(calls: list[int] = [0]) -> None:  # noqa: B006 - a usual place for a memory
