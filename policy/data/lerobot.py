@@ -198,7 +198,8 @@ def _read_episodes(info: _Info) -> list[_Row]:
         raise DatasetError(
             f"{info.folder}: {table.num_rows} episodes in it; must be 1 to {_MAX_EPISODES}"
         )
-    episodes = number_column(f"{info.folder}, meta/episodes", table, "episode_index")
+    where = f"{info.folder}, meta/episodes"
+    episodes, *_ = [number_column(where, table, column) for column in columns]
     found, counts = np.unique(episodes, return_counts=True)
     if counts.max() > 1:  # it could be both trained on and held out
         raise DatasetError(
@@ -255,7 +256,11 @@ def _read_table(path: Path, columns: Sequence[str], max_rows: int = MAX_ROWS) ->
 
 
 def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
-    return table.filter(pa.array(table["episode_index"].to_numpy() == row.episode_index))
+    is_inside = number_column(row.name, table, "episode_index") == row.episode_index
+    try:
+        return table.filter(pa.array(is_inside))
+    except pa.ArrowException as error:  # strings where numbers should be
+        raise DatasetError(f"{row.name}: {row.data} has an unusable column: {error}") from error
 
 
 def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:

@@ -210,3 +210,21 @@ def test_an_image_that_cannot_be_used_is_named(encoded: bytes | None, tmp_path: 
     _rows(CAMERA, lambda cells: [*cells[:2], {"bytes": encoded, "path": "2.png"}, *cells[3:]])(root)
     with pytest.raises(DatasetError, match="episode 0: the image of row 2 is not a PNG"):
         list(read_dataset(root)[0].decode())
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "values", "said"),
+    [
+        (ROWS, "episode_index", pa.array([[1.0]] * 20), "episode_index must hold a number a row"),
+        (ROWS, "action", pa.array(["a"] * 20, pa.string_view()), "has an unusable column"),
+        (EPISODES, "length", pa.array([1, 2], pa.timestamp("ns")), "length must hold a number"),
+    ],
+)
+def test_columns_of_another_type_are_named(
+    tmp_path: Path, file: str, column: str, values: pa.Array, said: str
+) -> None:
+    path = write(tmp_path / "a") / file
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index(column), column, values), path)
+    with pytest.raises(DatasetError, match=said):
+        read_dataset(tmp_path / "a")
