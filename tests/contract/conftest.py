@@ -6,6 +6,7 @@ clock and new for each test. docs/dev/contract_suite.md says what the suite does
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 import pytest
@@ -14,7 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from helpers.contract_peers import Companion, ExternalPeer, MockPeer, Peer
 from helpers.copter_companion import CopterCompanion
 from helpers.px4_companion import Px4Companion
-from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName, VehicleConfig
+from mavbridge.simulation.world import NOMINAL_VEHICLE
+from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName
 
 PEER, ALLOW, RECEIVER = ("MAVBRIDGE_TEST_PEER", "MAVBRIDGE_TEST_ALLOW", "MAVBRIDGE_TEST_RECEIVER")
 PERMISSIONS = ("ground", "arm", "fly")
@@ -87,9 +89,8 @@ def _stage(item: pytest.Item) -> int:
 def _peer(request: pytest.FixtureRequest, autopilot: AutopilotName, *, receiver: bool) -> Peer:
     if EXTERNAL in request.config.stash:
         return request.config.stash[EXTERNAL].peer
-    return MockPeer(
-        VehicleConfig(autopilot=autopilot, receiver_us=IDLE_RECEIVER_US if receiver else None)
-    )
+    receiver_us = IDLE_RECEIVER_US if receiver else None
+    return MockPeer(replace(NOMINAL_VEHICLE, autopilot=autopilot, receiver_us=receiver_us))
 
 
 def _need(request: pytest.FixtureRequest, permission: str) -> None:

@@ -75,7 +75,7 @@ def test_throttle_is_a_climb_rate_in_alt_hold(flying):
 
 
 def test_a_forced_reboot_in_flight_leaves_it_disarmed_in_its_boot_mode(expendable):
-    before_ms = last(expendable.seen, "ATTITUDE").time_boot_ms
+    before_ms = last(expendable.hold(1.5), "ATTITUDE").time_boot_ms
     assert expendable.command(REBOOT, 1, 0, 0, 0, 0, REBOOT_FORCE) == ACCEPTED
     expendable.advance(1.0)
     expendable.seen.clear()

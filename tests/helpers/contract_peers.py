@@ -9,6 +9,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
+from sitl.course import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import VehicleConfig
 
@@ -19,6 +20,12 @@ FORCE = 21196
 REBOOT_FORCE = 20190226
 VELOCITY_MASK = 0x5C7
 """All fields ignored but a velocity and a yaw rate."""
+ALOFT = AirborneStart(
+    position_ned_m=(0.0, 0.0, -8.0),
+    velocity_ned_mps=(0.0, 0.0, 0.0),
+    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+    next_gate=0,
+)
 
 
 class Peer(Protocol):
@@ -30,6 +37,10 @@ class Peer(Protocol):
 
     def advance(self, duration_ns: int) -> bytes:
         """Let time pass; return the bytes received meanwhile."""
+        ...
+
+    def put_in_air(self) -> None:
+        """Spare a simulated vehicle its takeoff."""
         ...
 
 
@@ -54,6 +65,9 @@ class MockPeer:
             self.vehicle.step(self._now_ns)
             taken += self.vehicle.take_outgoing(0)
         return taken
+
+    def put_in_air(self) -> None:
+        self.vehicle.launch(ALOFT)
 
 
 class ExternalPeer:
@@ -83,6 +97,9 @@ class ExternalPeer:
         while data := self._link.recv(65_535):
             taken += bytes(data)
         return taken
+
+    def put_in_air(self) -> None:
+        pass
 
     def close(self) -> None:
         self._link.close()

@@ -77,6 +77,7 @@ class CopterCompanion(Companion):
             self.stream(message_id, 50)
         self.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
         self.override(1500, 1500, 1500, 1500)
+        self.peer.put_in_air()
         if self.in_the_air:
             assert self.set_mode(GUIDED) == ACCEPTED
         else:

@@ -156,6 +156,7 @@ class Px4Companion(Companion):
         """Climb some metres, level and still, with sticks centred; then enter the mode."""
         self.sticks(MID)
         self.track()
+        self.peer.put_in_air()
         if not self.in_the_air:
             self.get_ready(ALTCTL)
             assert self.arm() == ACCEPTED
