@@ -15,7 +15,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
-from policy.motion.controllers import LEG_MPS, LEG_S, Motion, Program, Push, make_program
+from policy.motion.controllers import Motion, Program, Push, make_program
 from policy.motion.scripted import ScriptedPolicy
 from policy.protocol import PolicyRunner
 from sitl.ardupilot.autopilot import ArduCopter
@@ -30,9 +30,6 @@ from sitl.vehicle.rotation import Quat, cos_tilt
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
 """Lean 15 degrees to the right, or fly 2 m/s to the right: far from neutral in every record."""
 HOVERING = make_program("hover", "sticks")
-SQUARE = make_program("square", "sticks")
-SQUARE_S = 4 * LEG_S
-LEG_M = LEG_MPS * LEG_S
 
 FLIGHT_MODES: dict[tuple[AutopilotName, ActionKind], str] = {
     ("ardupilot", "sticks"): "ALT_HOLD",
