@@ -47,6 +47,32 @@ def test_another_stations_sticks_release_ours_and_no_mode_command_ever_leaves() 
     assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
 
 
+def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
+    """For a takeoff of five seconds that ends in a lean."""
+    return (0.7, 0.0, 0.0, 0.0) if t_s < 3 else (0.2, 0.0, 0.0, 0.5)
+
+
+def test_without_a_receiver_no_takeover_leaves_a_lean_behind() -> None:
+    """A release alone keeps the last sticks there: for 1 s, or for ever with FS_THR_ENABLE 0."""
+    flight = GuardFlight(climbing_then_leaning, receiver_us=None, arm=True).take_off(5)
+    assert flight.record()[-1]["lean_deg"] > 10
+    before_ns = flight.clock.now_ns()
+    flight.pilot_mode(Mode.STABILIZE)
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
+    given_ns, given_s = flight.clock.now_ns(), flight.record()[-1]["t_s"]
+    flight.run(0.9)
+    assert flight.modes[-1] == "STABILIZE"
+    assert not flight.modes_asked(before_ns)
+    overrides = [us for _, us in flight.overrides(given_ns - MS)]
+    (roll, pitch, _, yaw), *releases = overrides
+    assert (roll, pitch, yaw) == (1500, 1500, 1500)
+    assert len(releases) > 10
+    assert set(releases) == {(0, 0, 0, 0)}
+    sticks = [entry["us"] for entry in flight.record(given_s + 0.02)]
+    assert sticks
+    assert all(us[0] == us[1] == us[3] == 1500 for us in sticks)
+
+
 def test_a_second_flight_without_a_receiver_is_held_at_its_end_as_the_first_was() -> None:
     """The end of an earlier flight's overrides is a radio failsafe while disarmed, too."""
     flight = GuardFlight(climbing_first, receiver_us=None, arm=True)
