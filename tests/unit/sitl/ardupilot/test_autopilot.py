@@ -9,15 +9,6 @@ from sitl.vehicle.config import IDLE_RECEIVER_US, VehicleConfig
 from sitl.vehicle.rotation import from_euler
 
 
-def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
-    pilot.take_off(mode=Mode.STABILIZE)
-    pilot.hold(1.0)
-    drift_mps = pilot.ap.truth.velocity_ned_mps[2]
-    pilot.hold(2.0, thr=1600)
-    assert abs(drift_mps) < 0.1
-    assert 2.5 < -pilot.ap.truth.velocity_ned_mps[2] < 4.5
-
-
 def test_rtl_comes_home_and_lands(pilot):
     pilot.ap.params.set("RTL_ALT", 500.0)
     pilot.take_off(height_m=4.0)

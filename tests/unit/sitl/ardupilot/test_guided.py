@@ -98,45 +98,6 @@ def test_angle_boost_keeps_the_thrust_of_a_leaning_vehicle_vertical(pilot):
     assert climb_mps(0.0) < -0.5
 
 
-def test_entering_from_a_lean_without_a_stream_levels_or_brakes(pilot):
-    for mode, stops in ((Mode.GUIDED_NOGPS, False), (Mode.GUIDED, True)):
-        in_the_air(other := type(pilot)(pilot.ap.config), Mode.ALT_HOLD)
-        other.hold(1.5, roll=1750)
-        assert other.ap.set_mode(mode)
-        other.silence(0.4)
-        assert stops or abs(roll_deg(other.ap)) < 2.0
-        other.silence(4.0)
-        assert (math.hypot(*other.ap.truth.velocity_ned_mps[:2]) < 0.3) == stops
-
-
-@pytest.mark.parametrize(
-    ("options", "thrust", "seconds"),
-    [(8, 0.55, 3.06), (0, 0.8, 4.0), (8, 0.25, None), (0, 0.5, None)],
-)
-def test_lift_off_times(pilot, options, thrust, seconds):
-    pilot.ap.params.set("GUID_OPTIONS", float(options))
-    armed(pilot, Mode.GUIDED_NOGPS)
-    armed_ns, lifted_ns = pilot.ap.now_ns, []
-
-    def watch(ap):
-        if pilot.height_m > 0.5:
-            lifted_ns.append(ap.now_ns)
-
-    stream(pilot, 6.0, lean(thrust=thrust), watch)
-    if seconds is None:
-        assert not lifted_ns
-    else:
-        assert (lifted_ns[0] - armed_ns) / NS_PER_S == pytest.approx(seconds, abs=0.3)
-
-
-def test_a_vehicle_landed_by_thrust_stays_armed(pilot):
-    in_the_air(pilot, Mode.GUIDED_NOGPS)
-    stream(pilot, 10.0, lean(thrust=0.0))
-    assert pilot.ap.landed
-    stream(pilot, 15.0, lean(thrust=0.0))
-    assert pilot.ap.armed
-
-
 def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot):
     pilot = type(pilot)(VehicleConfig(receiver_us=MID_RECEIVER_US, position_ready_s=math.inf))
     pilot.silence(6.0)

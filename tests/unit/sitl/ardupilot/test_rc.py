@@ -22,46 +22,6 @@ def engine(*, receiver=True, **params):
     return RcEngine(store, IDLE_RECEIVER_US if receiver else None), store
 
 
-def run(rc, start_ms, end_ms):
-    for ms in range(start_ms, end_ms):
-        rc.update(ms * NS_PER_MS)
-
-
-@pytest.mark.parametrize(
-    ("options", "channels_us"), [(0, [1700, 1500]), (1, [1700, 0]), (2, [1500, 1500])]
-)
-def test_options_ignore_receiver_or_overrides(options, channels_us):
-    rc, _ = engine(RC_OPTIONS=options)
-    rc.override([1700] + [KEEP] * 7, 0)
-    run(rc, 0, 50)
-    assert rc.channels_us[:2] == channels_us
-
-
-def test_the_override_switch_cuts_overrides_after_its_debounce():
-    rc, _ = engine(receiver=False, RC7_OPTION=46.0)
-    rc.override([1700, KEEP, KEEP, KEEP, KEEP, KEEP, 1900, KEEP], 0)
-    run(rc, 0, 500)
-    rc.override([1700, KEEP, KEEP, KEEP, KEEP, KEEP, 1000, KEEP], 500 * NS_PER_MS)
-    run(rc, 500, 650)
-    rc.override([1650] + [KEEP] * 7, 650 * NS_PER_MS)
-    run(rc, 650, 651)
-    assert rc.channels_us[0] == 1650
-    run(rc, 651, 1000)
-    rc.override([1600] + [KEEP] * 7, 1000 * NS_PER_MS)
-    run(rc, 1000, 1100)
-    assert rc.channels_us[0] == 1650
-
-
-def test_manual_control_axes_can_be_absent_and_negative_thrust_is_refused():
-    rc, _ = engine()
-    rc.manual_control(x=32767, y=1000, z=32767, r=-1000, now_ns=0)
-    run(rc, 0, 50)
-    assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
-    rc.manual_control(x=0, y=0, z=-1, r=0, now_ns=50 * NS_PER_MS)
-    run(rc, 50, 100)
-    assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
-
-
 def test_a_receiver_may_turn_up_later():
     rc, _ = engine(receiver=False)
     rc.set_receiver([0] * 8)

@@ -7,13 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import last, named
+from helpers.contract_peers import named
 from helpers.ends import Ends
 from sitl.ardupilot.endpoint import ArduPilotTelemetry
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import VehicleConfig
 
 
 def test_only_heartbeats_and_timesync_come_without_a_request(station):
@@ -62,40 +61,6 @@ def test_positions_are_withheld_until_the_estimator_has_one(station, message_id)
     assert named(station.run(0.2), name)
 
 
-def test_imu_units_and_oddities(station):
-    for message_id in (mav.MAVLINK_MSG_ID_RAW_IMU, mav.MAVLINK_MSG_ID_HIGHRES_IMU):
-        station.interval(message_id, 100)
-    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-    messages = station.run(1.0)
-    raw = named(messages, "RAW_IMU")[-1]
-    highres = named(messages, "HIGHRES_IMU")[-1]
-    attitude = named(messages, "ATTITUDE")[-1]
-    assert (raw.zacc, raw.xgyro) == (-1000, 3)
-    assert highres.zacc == pytest.approx(-9.81, abs=0.01)
-    assert highres.xgyro - attitude.rollspeed == pytest.approx(0.003, abs=1e-6)
-    assert highres.xmag > 1e5
-    assert (highres.fields_updated, highres.id) == (8191, 0)
-
-
-def test_streams_slow_down_while_parameters_are_sent(station):
-    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 200)
-    station.run(0.1)
-    station.send(mav.MAVLink_param_request_list_message(1, 1))
-    messages = station.run(0.2)
-    afterwards = station.run(1.5)
-    assert named(messages, "PARAM_VALUE")
-    assert len(named(messages, "ATTITUDE")) <= 12
-    assert len(named(afterwards[-200:], "ATTITUDE")) > 150
-
-
-def test_sticks_and_a_system_id_beyond_their_range_go_out_as_their_low_bytes(station):
-    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 50)
-    station.send(mav.MAVLink_manual_control_message(1, 0, -5000, 500, 0, 0))
-    station.vehicle.params.set("MAV_SYSID", 300.0)
-    channels = named(station.run(0.1), "RC_CHANNELS")[-1]
-    assert (channels.get_srcSystem(), channels.chan1_raw) == (300 - 256, 65536 - 1000)
-
-
 def test_nan_in_a_message_is_refused_and_counted(station):
     station.send(mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", math.nan, 9))
     assert not named(station.run(0.1), "PARAM_VALUE")
@@ -125,13 +90,6 @@ def test_command_results(station, number, params, result):
     assert station.command(number, *params) == result
 
 
-def test_the_gcs_only_option_silences_everybody_else(station):
-    station.vehicle.params.set("MAV_OPTIONS", 1.0)
-    for system_id, answers in ((42, 0), (255, 1), (1, 1)):
-        station.send(mav.MAVLink_timesync_message(0, 5), system_id=system_id)
-        assert len(named(station.run(0.01), "TIMESYNC")) == answers
-
-
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=300), max_size=8))
 def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
@@ -143,16 +101,6 @@ def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
         vehicle.receive(0, ping, 0)
     answers = mav.MAVLink(None).parse_buffer(vehicle.take_outgoing(0)) or []
     assert any(m.get_type() == "TIMESYNC" and m.ts1 == 77 for m in answers)
-
-
-def test_an_eleventh_interval_joins_the_nearest_of_ten(station):
-    link = station.vehicle.server.links[0]
-    first, *others, eleventh = sorted(set(ArduPilotTelemetry.names) - {0})[:10]
-    for index, message_id in enumerate((first, *others)):
-        assert link.set_interval(message_id, (10 + index) * 1000)
-    assert link.set_interval(eleventh, 142_000)
-    assert link.interval_us(eleventh) == 18_000
-    assert link.interval_us(first) == 10_000
 
 
 def test_the_report_counts_the_setpoints_that_were_followed(station):
@@ -167,29 +115,3 @@ def test_the_report_counts_the_setpoints_that_were_followed(station):
     setpoints = vehicle.log.summary(vehicle.ap)["setpoints"]
     assert setpoints["count"] == 5
     assert setpoints["rate_hz"] == pytest.approx(50.0, rel=0.01)
-
-
-def override(station, *values_us):
-    station.send(mav.MAVLink_rc_channels_override_message(1, 1, *values_us, *[65535] * 4))
-    return station.run(0.2)
-
-
-def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health():
-    receiver = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-    config = VehicleConfig(receiver_us=None, estimator_ready_s=0.0, position_ready_s=0.0)
-    station = Ends(config=config)
-    station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
-    station.interval(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
-    assert not last(station.run(0.2), "SYS_STATUS").onboard_control_sensors_present & receiver
-    override(station, 1500, 1500, 1000, 1500)
-    assert station.vehicle.ap.set_mode(Mode.ALT_HOLD)
-    assert station.vehicle.ap.arm(force=False)
-    for messages, is_healthy, state in (
-        (override(station, 1500, 1500, 1000, 1500), True, mav.MAV_STATE_ACTIVE),
-        (station.run(1.2), False, mav.MAV_STATE_CRITICAL),
-        (override(station, 1500, 1500, 1000, 1500), True, mav.MAV_STATE_STANDBY),
-    ):
-        status = last(messages, "SYS_STATUS")
-        assert status.onboard_control_sensors_present & receiver
-        assert bool(status.onboard_control_sensors_health & receiver) == is_healthy
-        assert last(messages, "HEARTBEAT").system_status == state

@@ -41,21 +41,6 @@ def test_a_ground_stations_link_gets_no_imu_and_a_companions_does():
     assert len([m for m in named(messages, "TIMESYNC") if m.tc1 == 0]) == pytest.approx(20, abs=1)
 
 
-def test_interval_zero_restores_the_default_of_the_link(ends):
-    link = ends.vehicle.server.links[0]
-    default_us = link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE)
-    for asked_us, interval_us in ((-1, -1), (4000, 4000), (0, default_us)):
-        assert link.set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, asked_us)
-        assert link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE) == interval_us
-    assert default_us == 20_000
-
-
-def test_an_interval_of_hours_is_reported_as_the_longest_that_the_message_holds(ends):
-    assert ends.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1e12) == mav.MAV_RESULT_ACCEPTED
-    assert ends.command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, 30) == mav.MAV_RESULT_ACCEPTED
-    assert ends.vehicle.server.links[0].interval_us(30) == 2**31 - 1
-
-
 @pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [float("nan"), 0, 0, 0]])
 def test_an_attitude_that_is_none_is_refused(ends, quaternion):
     ends.send(mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, quaternion, 0, 0, 0, 0.5))
