@@ -75,7 +75,7 @@ class HoldsDistance:
 
 def height_flown_m(runner: PolicyRunner, *sinks: ListSink) -> float:
     flight = SimulatedFlight(course_seed=3, seed=0)
-    result = flight.fly(runner, max_time_s=8.0, sinks=sinks)
+    result = flight.fly(runner, max_time_s=6.0, sinks=sinks)
     assert result.outcome == "timed out", result
     return -flight.vehicle.ap.truth.position_ned_m[2]
 

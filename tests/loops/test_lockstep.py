@@ -13,7 +13,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.errors import UserError
 from mavbridge.core.records import Tick
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delay, Delays
@@ -23,8 +23,7 @@ from mavbridge.simulation.world import Exposure
 from policy.contract import FloatArray
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner
-from sitl.pilot.demonstrator import Expert
-from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.config import STEP_NS
 
 MS = NS_PER_MS
 HOP_NS = MS // 10
@@ -146,22 +145,6 @@ def test_a_policy_that_looks_at_more_sees_a_larger_camera() -> None:
     assert {vision.rgb.shape for vision in sink.visions} == {(256, 256, 3)}
 
 
-def test_a_pilot_with_the_true_state_flies_all_gates() -> None:
-    one = flight(course_seed=1_000_003)
-    expert = Expert(one.course, 3.0, params=one.vehicle.params)
-    pilot = steady(lambda: expert.sticks(one.vehicle.ap.truth, one.clock.now_ns() / NS_PER_S))
-    result = one.fly(pilot, max_time_s=60.0)
-    assert result.outcome == "finished"
-    assert result.gates_passed == result.gates_total == 8
-    assert list(result.gate_times_s) == sorted(result.gate_times_s)
-    assert result.course_s == result.gate_times_s[-1]
-    assert result.flown_s == pytest.approx(result.gate_times_s[-1] + 1.0, abs=0.01)
-    assert 1.0 < result.mean_speed_mps < 3.5
-    assert result.stick_rate_per_s is not None
-    # The sticks were given back: the receiver's idle throttle is what the vehicle acts on.
-    assert one.vehicle.ap.rc.channels_us[2] == 1000
-
-
 def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
     sink = climb(BLIND, seed=5)
     ticks = flown(sink)
@@ -181,7 +164,7 @@ def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
         assert stamps == sorted(stamps)
 
 
-@pytest.mark.parametrize(("stick_hz", "action_hz"), [(50, 100.0), (100, 5.0), (400, 30.0)])
+@pytest.mark.parametrize(("stick_hz", "action_hz"), [(50, 100.0), (400, 5.0)])
 def test_the_sticks_keep_their_rate_whatever_the_rate_of_the_policy(
     stick_hz: float, action_hz: float
 ) -> None:
@@ -219,19 +202,16 @@ def test_single_rate_takes_the_time_of_the_whole_network_for_every_action() -> N
     assert {vision.ready_ns - vision.started_ns for vision in sink.visions} == {0}
 
 
-@pytest.mark.parametrize("program", ["hover", "circle", "square", "yaw"])
-def test_the_scripted_policies_fly(program: str) -> None:
+def test_a_scripted_policy_flies() -> None:
     one = flight()
-    wanted = PolicyConfig(policy=f"scripted:{program}", dual_rate=True)
+    wanted = PolicyConfig(policy="scripted:circle", dual_rate=True)
     runner: PolicyRunner = load_configured_policy(wanted, one.clock).runner
     result = one.fly(runner, max_time_s=9.0)
     assert result.outcome == "timed out"
     body = one.vehicle.ap.truth
     assert -body.position_ned_m[2] == pytest.approx(3.0, abs=1.0)
-    if program in ("circle", "square"):
-        assert result.distance_m > 6.0
-    if program in ("circle", "yaw"):
-        assert abs(body.ned_from_body_wxyz[3]) > 0.3
+    assert result.distance_m > 6.0
+    assert abs(body.ned_from_body_wxyz[3]) > 0.3
 
 
 def test_a_crash_ends_the_flight() -> None:
@@ -260,12 +240,6 @@ def test_the_error_of_a_policy_that_fails_is_not_swallowed() -> None:
         one.fly(steady(fail))
 
 
-def never_ready() -> EpisodeResult:
-    vehicle = VehicleConfig(estimator_ready_s=1000.0)
-    one = SimulatedFlight(course_seed=3, seed=0, settings=BLIND, vehicle=vehicle)
-    return one.fly(steady(lambda: CLIMB))
-
-
 def interrupted() -> EpisodeResult:
     one = flight()
     stop_ns = one.clock.now_ns() + 6 * NS_PER_S
@@ -285,7 +259,6 @@ def twice() -> EpisodeResult:
 @pytest.mark.parametrize(
     ("fly", "error", "message"),
     [
-        (never_ready, PeerError, "did not get the sticks within 30 s"),
         (interrupted, EpisodeInterruptedError, "course 3: interrupted"),
         (negative_seed, UserError, "non-negative"),
         (twice, UserError, "flown once"),

@@ -165,20 +165,15 @@ PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
 @pytest.mark.parametrize(
     "changes",
     [
-        {},
-        {"dual_rate": False},
-        {"state_extras": ("height", "goal", "altitude")},
-        {"state_extras": ("height",), **PAST},
-        {"state_extras": ("height",), "state_frame": "enu_flu", "since_exposure": True},
-        {"since_exposure": True, **PAST},
+        {"dual_rate": False, "state_extras": ("height", "goal", "altitude")},
+        {"state_extras": ("height",), "state_frame": "enu_flu", "since_exposure": True, **PAST},
         {"state_time": "execution", "since_exposure": True, "state_extras": ("altitude", "height")},
         {"state_time": "execution", "action": "velocity", "state_frame": "enu_flu", **PAST},
         {"state_extras": ("height",), **TWO_EYES, **PAST},
-        {"prefix_len": 4},
         {"history_len": 1, "history_dt_s": 0.001},
-        {"history_len": 64, "history_dt_s": 0.003},
+        {"prefix_len": 4, "history_len": 64, "history_dt_s": 0.003},
     ],
-    ids=lambda changes: ", ".join(changes) or "plain",
+    ids=", ".join,
 )
 def test_every_field_of_the_state_is_repeated_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
@@ -188,12 +183,12 @@ def test_every_field_of_the_state_is_repeated_bit_for_bit(
     assert_equal(compared)
 
 
-@pytest.mark.parametrize("changes", [{}, {"state_extras": ("height",), **PAST}])
 def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(
-    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """What they saw counts in later past states, and is not recorded: these are taken as given."""
-    compared = flown_and_repeated(monkeypatch, attentive(Hesitant, **changes))
+    make = attentive(Hesitant, state_extras=("height",), **PAST)
+    compared = flown_and_repeated(monkeypatch, make)
     assert compared.missing == {}
     assert set(compared.inputs_differ) <= set(PAST_INPUTS)
     assert compared.equal_chunks == compared.solves >= 50
@@ -203,10 +198,8 @@ def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(
     ("autopilot", "changes"),
     [
         ("px4", {"state_extras": ("height", "altitude")}),
-        ("px4", {"action": "rates"}),
-        ("ardupilot", {"action": "rates", "state_frame": "enu_flu"}),
+        ("px4", {"action": "rates", "state_frame": "enu_flu"}),
         ("ardupilot", {"action": "attitude", "state_extras": ("height",)}),
-        ("px4", {"action": "velocity", "state_frame": "enu_flu"}),
     ],
 )
 def test_every_kind_of_action_is_repeated_bit_for_bit(
