@@ -27,8 +27,7 @@ def start(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("name", OURS)
-@pytest.mark.parametrize("is_folder", [False, True])
+@pytest.mark.parametrize(("name", "is_folder"), [*zip(OURS, (False, True), strict=True)])
 def test_a_file_that_hides_one_of_ours_is_named(tmp_path: Path, name: str, is_folder: bool) -> None:
     hiding = tmp_path / name / "__init__.py" if is_folder else tmp_path / f"{name}.py"
     hiding.parent.mkdir(exist_ok=True)

@@ -11,14 +11,13 @@ from helpers.factories import make_guard_tick, make_plan, make_solve, make_trace
 from helpers.fakes import START_NS, ListSink, level_telemetry, samples_of, without
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ForwardedPacket, Reading, Sticks, Telemetry
+from mavbridge.core.vehicle import Reading, Sticks, Telemetry
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     GuardError,
     GuardStatus,
-    Packets,
     Samples,
     encode_samples,
 )
@@ -80,16 +79,6 @@ class Awaited(NamedTuple):
         assert self.port.send(encode_samples(samples_of(telemetry)))
 
 
-def test_samples_are_the_newest_telemetry() -> None:
-    viewed = Viewed().receive(Viewed().samples(height_m=7.5))
-    telemetry = viewed.view.telemetry
-    assert samples_of(telemetry) == Viewed().samples(height_m=7.5).samples
-    assert telemetry.ned_from_body_wxyz is not None
-    assert telemetry.ned_from_body_wxyz.happened_ns == START_NS - 2 * MS
-    assert viewed.view.attitude_ns == START_NS
-    assert viewed.view.height_m == 7.5
-
-
 def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
     view = Viewed(Contract(observation_steps=2)).view
     first, second, third = (level_telemetry(START_NS + k * MS) for k in range(3))
@@ -98,15 +87,6 @@ def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
     assert view.take_past(START_NS + MS) == [first]
     assert view.take_past(START_NS + 2 * MS) == [third]
     assert view.take_past(START_NS + 2 * MS) == []
-
-
-def test_packets_go_to_the_recorder_alone() -> None:
-    kept: list[ForwardedPacket] = []
-    view = Viewed(watch_packets=kept.extend).view
-    packet = ForwardedPacket(START_NS, START_NS, b"\xfd\x05nonsense")
-    view.receive(Packets((packet,)))
-    assert kept == [packet]
-    assert view.attitude_ns == 0
 
 
 def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:

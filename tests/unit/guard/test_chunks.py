@@ -248,11 +248,6 @@ def test_without_a_new_chunk_it_coasts_within_grace_limits_and_horizon_and_is_th
         assert figures(late, "quantity", "spent_ms") == (quantity, until_ms - 1000)
 
 
-@pytest.mark.parametrize(("period_ms", "grace_ms"), [(2, 100), (10, 100), (33, 100), (500, 1500)])
-def test_the_grace_is_100_ms_or_three_periods(period_ms: int, grace_ms: int) -> None:
-    assert buffer(period_ms).grace_ns == grace_ms * MS
-
-
 @pytest.mark.parametrize(
     ("refusal", "heard_ms", "until_ms"),
     [

@@ -157,14 +157,6 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(
     assert [move.control for move in moves].index(RELEASE) == waits
 
 
-def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
-    stepped = flying(IDLE_RECEIVER)
-    moves = [stepped.step(**FAULT), *stepped.run(0.99)]
-    assert sum(move.mode == "BRAKE" for move in moves) == 10
-    assert {move.control for move in moves} == {NEUTRAL}
-    assert stepped.step(mode="BRAKE").control is RELEASE
-
-
 def test_a_refused_mode_becomes_land() -> None:
     stepped = at_fault(IDLE_RECEIVER)
     moves = stepped.run(0.2, refused_mode="BRAKE")

@@ -71,7 +71,6 @@ OTHER = TogeConfig(
     ("config", "steps"),
     [
         (ResnetUnetConfig(contract=replace(SMALL, since_exposure=True)), 1),
-        (OTHER, 1),
         (OTHER, MAX_UNROLLED + 1),
     ],
 )
@@ -125,16 +124,8 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatc
     assert len(cached(tmp_path)) == 6
 
 
-def test_openvino_is_kept_from_calling_home() -> None:
-    program = (
-        "import sys; import policy.engines.openvino_modules; "
-        "sys.exit(sys.modules.get('openvino_telemetry') is not None)"
-    )
-    assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0
-
-
 SIGNALS = """
-import ctypes, gc, os, signal
+import gc, os, signal, sys
 from policy.loading.request import PolicyRequest
 from policy.loading.load import load_policy
 
@@ -150,17 +141,17 @@ del loaded
 gc.collect()
 signal.signal(signal.SIGINT, lambda *_: heard.append("after it"))
 os.kill(os.getpid(), signal.SIGINT)
-print(heard)
+print(heard, sys.modules["openvino_telemetry"])
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the alternate signal stack is kept on Linux")
-def test_a_signal_is_heard_whatever_has_become_of_the_engine() -> None:
+def test_a_signal_is_heard_whatever_has_become_of_the_engine_which_does_not_call_home() -> None:
     ran = subprocess.run(
         [sys.executable, "-c", SIGNALS], capture_output=True, text=True, timeout=120, check=False
     )
     assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.strip() == "['in flight', 'after it']"
+    assert ran.stdout.strip() == "['in flight', 'after it'] None"
 
 
 BLOB = b"a compiled graph" * 100
