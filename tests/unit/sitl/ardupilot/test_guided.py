@@ -55,17 +55,11 @@ def pilot(pilot):
     return type(pilot)(VehicleConfig(receiver_us=MID_RECEIVER_US))
 
 
-def armed(pilot, mode):
-    pilot.silence(6.0)
-    assert pilot.ap.set_mode(mode)
-    assert pilot.ap.arm(force=False), pilot.texts()
-
-
 def in_the_air(pilot, mode=Mode.GUIDED):
-    armed(pilot, Mode.GUIDED)
-    assert pilot.ap.take_off(6.0)
-    pilot.silence(12.0)
+    pilot.silence(5.5)  # until it has a position
+    pilot.ap.launch((0.0, 0.0, -6.0), ZERO, (1.0, 0.0, 0.0, 0.0))
     assert pilot.ap.set_mode(mode)
+    pilot.silence(0.5)
     pilot.texts()
 
 
