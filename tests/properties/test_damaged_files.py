@@ -105,7 +105,7 @@ json_values = st.recursive(
 )
 
 
-@settings(BOUNDED, max_examples=200)
+@settings(BOUNDED, max_examples=60)
 @given(name=st.sampled_from(["meta.json", "settings.json"]), data=st.data())
 def test_a_changed_value_of_the_right_file_is_read_or_refused(
     name: str, data: st.DataObject, tmp_path: Path
