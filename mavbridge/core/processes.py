@@ -4,6 +4,7 @@ import os
 import random
 import socket
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -23,17 +24,17 @@ PORTS_TO_GIVE = range(20_000, 32_768)
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     """Return a UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback interface, given only once.
 
-    Its number stays bound in the other protocol until this process ends, so that two processes
-    that ask at the same time get two ports. Raises ``UserError`` if no port is free.
+    On Linux an abstract socket with its number stays bound until this process ends, so that two
+    processes that ask at the same time get two ports. Raises ``UserError`` if no port is free.
     """
-    claiming = socket.SOCK_STREAM if kind is socket.SOCK_DGRAM else socket.SOCK_DGRAM
     for port in random.SystemRandom().sample(PORTS_TO_GIVE, k=len(PORTS_TO_GIVE)):
         with (
-            socket.socket(socket.AF_INET, claiming) as claim,
+            socket.socket(socket.AF_UNIX) as claim,
             socket.socket(socket.AF_INET, kind) as probe,
             suppress(OSError),
         ):
-            claim.bind(("127.0.0.1", port))
+            if sys.platform == "linux":
+                claim.bind(f"\0mavbridge-port-{port}")
             probe.bind(("127.0.0.1", port))
             claim.detach()
             return port
