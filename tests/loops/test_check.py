@@ -12,6 +12,7 @@ from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.flight.plan import plan_flight
+from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
@@ -267,6 +268,24 @@ def test_a_vehicle_that_is_absent_is_one_clear_no_go() -> None:
     assert rows["vehicle"].verdict == "no-go"
     assert "heard nothing" in rows["vehicle"].advice
     assert bench.clock.now_ns() - began_ns < 4 * NS_PER_S
+
+
+def test_a_vehicle_that_falls_silent_while_it_is_measured_is_a_no_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench, restart = Bench(), MavlinkLink.restart_counters
+
+    def mute() -> None:
+        bench.vehicle.take_outgoing = lambda link: b""  # type: ignore[method-assign]
+
+    def begin(link: MavlinkLink) -> None:
+        restart(link)
+        bench.clock.schedule(bench.clock.now_ns() + NS_PER_S, mute)
+
+    monkeypatch.setattr(MavlinkLink, "restart_counters", begin)
+    row = bench.check()["vehicle"]
+    assert row.verdict == "no-go"
+    assert "the vehicle's heartbeat is lost" in row.advice
 
 
 def test_no_policy_leaves_out_what_only_a_policy_knows() -> None:

@@ -28,7 +28,7 @@ from mavbridge.flight.settings import effective_freshness, guard_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
-from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.mavlink.session.vehicle import HEARTBEAT_TIMEOUT_NS, VehicleSession
 from mavbridge.mavlink.transport.connection import Transport
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
@@ -38,8 +38,8 @@ from policy.contract import Contract
 SET_UP_S = 15.0
 """Longest wait for version, parameters, streams and the receiver. A link without losses takes one
 to three seconds."""
-SETTLE_S, MEASURE_S = 1.0, 3.0
-"""Time from the grant of the streams until their rates are counted, and time of counting."""
+SETTLE_S, MEASURE_S, LOST_S = 1.0, 3.0, HEARTBEAT_TIMEOUT_NS / NS_PER_S
+"""Time from granted streams to counting, time of counting, longest wait for a heartbeat."""
 ECHO_S, RELEASE_S = 3.0, 4.0
 """Longest wait for the echo; longest time over which the releases of an override are spread."""
 _POLL_NS = NS_PER_MS
@@ -92,14 +92,9 @@ class VehicleProbe:
             self._pass()
         return vehicle
 
-    def set_up(self) -> Reason | None:
-        """Read parameters and request streams; return the step that did not finish in time."""
-
-        def unfinished() -> Reason | None:
-            return self.find().unfinished(self._clock.now_ns())
-
-        self._until(SET_UP_S, lambda: unfinished() is None)
-        return unfinished()
+    def set_up(self) -> None:
+        """Read parameters and request streams, as far as they get in time."""
+        self._until(SET_UP_S, lambda: self.find().unfinished(self._clock.now_ns()) is None)
 
     def measure(self) -> LinkStats:
         """Count messages, losses and round trips."""
@@ -107,6 +102,12 @@ class VehicleProbe:
         self._link.restart_counters()
         self._until(MEASURE_S)
         return self._link.stats()
+
+    def problem(self) -> Reason | None:
+        """Wait for one more heartbeat; return why the vehicle cannot be flown, or None."""
+        begun_ns = self._clock.now_ns()
+        self._until(LOST_S, lambda: (self.find().condition.heartbeat or (0,))[0] > begun_ns)
+        return self.find().problem(self._clock.now_ns())
 
     def snapshot(self) -> LinkSnapshot:
         """Return everything that the link knows now."""
@@ -188,8 +189,8 @@ def check_vehicle(
             link.begin_flight(meaning, None if config.link.output == "auto" else config.link.output)
             probe = VehicleProbe(link, clock)
             probe.find()
-            unfinished = probe.set_up()
-            stats = probe.measure()
+            probe.set_up()
+            stats, problem = probe.measure(), probe.problem()
             vehicle, snapshot, texts = probe.find(), probe.snapshot(), list(probe.texts)
             terms = Terms(
                 config=config,
@@ -198,7 +199,7 @@ def check_vehicle(
                 vehicle=vehicle,
                 is_deaf=not (vehicle.version or vehicle.params.values or stats.rtt_ms),
             )
-            rows += _link_rows(vehicle, stats, terms, unfinished)
+            rows += _link_rows(stats, terms, problem)
             if echo_test and not terms.is_deaf:
                 rows.append(_echo_row(probe, terms))
             rows += _vehicle_rows(vehicle, snapshot.status, terms)
@@ -209,11 +210,10 @@ def check_vehicle(
     return rows
 
 
-def _link_rows(
-    vehicle: VehicleSession, stats: LinkStats, terms: Terms, unfinished: Reason | None
-) -> Iterator[CheckRow]:
+def _link_rows(stats: LinkStats, terms: Terms, problem: Reason | None) -> Iterator[CheckRow]:
+    vehicle = terms.vehicle
     place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
-    no_go = "" if unfinished is None else f"the set-up of the link did not finish: {unfinished}"
+    no_go = "" if problem is None else f"the link is not ready: {problem}"
     no_go = _DEAF if terms.is_deaf else no_go
     found = f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}"
     yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
