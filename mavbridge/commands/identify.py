@@ -206,7 +206,8 @@ def _fit_push(
     within = (input_s >= begin_s) & (input_s <= end_s)
     if np.diff(np.concatenate([[begin_s], input_s[within], [end_s]])).max() > LONGEST_GAP_S:
         return "the policy did not fly all of it"
-    up, down = float(inputs[within].max()), float(inputs[within].min())
+    pushing = inputs[within & (input_s < end_s - EARLY_S)]  # feedback may return before the end
+    up, down = float(pushing.max(initial=0.0)), float(pushing.min(initial=0.0))
     if up <= 0.0 or down >= 0.0:
         return "it was not pushed to both sides"
     grid_s = np.arange(begin_s - BEFORE_S - LEAD * STEP_S, end_s - EARLY_S, STEP_S)
