@@ -219,7 +219,7 @@ def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
     for name, measured in flight.times_ms:
         yield Figure(f"{name}, p50", "ms", None if measured is None else measured.p50, 2)
         yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
-    path_m = flight.track.length_m if flight.track else 0.0
+    path_m = flight.track.length_m if flight.track else None
     yield Figure("path", "m", path_m, more_is_better=None)
     gates_passed, outcome = flight.meta.gates_passed, flight.meta.outcome
     if gates_passed is None and outcome is not None:

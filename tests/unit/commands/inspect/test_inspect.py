@@ -144,6 +144,7 @@ def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Pat
     assert rows["late chunks"][:3] == ["1", "0", "-100% better"]
     assert rows["predict, p50 [ms]"][2] == "+100% worse"
     assert rows["gates passed"][:2] == ["-", "5"]
+    assert rows["path [m]"][:3] == ["8.8", "-", "-"], "no position is no path of 0 m"
 
 
 def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
