@@ -1,6 +1,6 @@
 """Newest reading of each quantity, and counters of the messages that carry them."""
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -94,6 +94,7 @@ class LinkCounters:
     def __init__(self) -> None:
         self._by_name: Counter[str] = Counter()
         self._last_sequence: int | None = None
+        self._recent: deque[int] = deque(maxlen=_MOST_OVERTAKEN)
         self._lost = 0
         self._first_ns: int | None = None
         self.heard_ns = 0
@@ -103,22 +104,27 @@ class LinkCounters:
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
         """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256).
 
-        An overtaken message fills the gap that it left; a doubled one leaves none.
+        An overtaken message fills the gap that it left; a doubled one counts once.
         """
-        self._by_name[name] += 1
         last = self._last_sequence
         ahead = 1 if last is None else (sequence - last) % 256
-        if ahead >= 256 - _MOST_OVERTAKEN:
+        if sequence in self._recent:
+            ahead = 0
+        elif ahead >= 256 - _MOST_OVERTAKEN:
             self._lost = max(self._lost - 1, 0)
         elif ahead > 0:
             self._lost += ahead - 1
             self._last_sequence = sequence
+        if ahead > 0:
+            self._by_name[name] += 1
+            self._recent.append(sequence)
         self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
         self.heard_ns = arrived_ns
 
     def new_sequence(self) -> None:
         """Accept any sequence number next: the sender has restarted."""
         self._last_sequence = None
+        self._recent.clear()
 
     @property
     def messages_per_s(self) -> tuple[tuple[str, float], ...]:
