@@ -38,6 +38,7 @@ Table = Literal["contract", "state", "action", "images", "task"]
 TRAIN_CONFIG_FILE = "train_config.json"
 _WIDTH = 96
 _MAX_STATE = 1000
+_HOVER = "hover_thrust"
 _SPELLINGS: Mapping[str, Sequence[str]] = {
     "vx_mps": ("vx", "vel_x", "velocity_x"),
     "vy_mps": ("vy", "vel_y", "velocity_y"),
@@ -326,12 +327,22 @@ def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[En
     ]
 
 
+def _gain_entries(kind: str) -> list[Entry]:
+    """Draft what no file tells of an action kind's training."""
+    known = {"sticks": STICK_TERMS[1:], "velocity": (), UNANSWERED: (*STICK_TERMS[1:], _HOVER)}
+    why = "what full sticks did, or which thrust hovered, in training; these are our defaults"
+    found: Literal["optional", "guessed"] = "optional" if kind == UNANSWERED else "guessed"
+    terms, usual = known.get(kind, (_HOVER,)), Contract()
+    return [Entry("contract", term, getattr(usual, term), why, found) for term in terms]
+
+
 def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
-    """Draft the action kind and the action's names: known, or asked for."""
+    """Draft the action kind, its gains and the action's names: known, or asked for."""
     kinds = [kind for kind, own in ACTION_FIELDS.items() if sorted(own) == sorted(names or ())]
     if kinds and names:
         return [
             Entry("contract", "action", kinds[0], where),
+            *_gain_entries(kinds[0]),
             Entry("action", "names", list(names), where),
         ]
     choices = "; ".join(f"{kind}: {', '.join(own)}" for kind, own in ACTION_FIELDS.items())
@@ -342,6 +353,7 @@ def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
     factor = f"{units}: a factor, e.g. -1.0 for another sign"
     return [
         Entry("contract", "action", UNANSWERED, asked),
+        *_gain_entries(UNANSWERED),
         Entry("action", "names", [UNANSWERED] * 4, order),
         Entry("action", "scale", [1.0] * 4, factor, "optional"),
         Entry("action", "offset", [0.0] * 4, f"{units}: added after the factor", "optional"),

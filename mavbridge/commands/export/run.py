@@ -25,7 +25,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import BODY_STATE_NAMES
-from policy.contract import ACTION_DIM, STATE_NAMES
+from policy.contract import ACTION_DIM, STATE_NAMES, STICK_TERMS
 from policy.data import lerobot_format as names
 from policy.data.flight_data import (
     DatasetError,
@@ -229,8 +229,9 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
     metas = [read_object(flight / "meta.json", DatasetError, kind) for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
     # The only camera is the vehicle's own under any name: the contract's default.
+    told = ("cameras", *STICK_TERMS)
     entries = [
-        *(entry for entry in dataset_entries(dataset) if entry.name != "cameras"),
+        *(entry for entry in dataset_entries(dataset) if entry.name not in told),
         *recorded_entries([each for each in contracts if isinstance(each, dict)]),
         Entry("task", "prompt", config.task, "--task"),
     ]

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from helpers.status import status_of, told_by
-from policy.adapters.interface import read_interface
-from policy.contract import ACTION_NAMES
+from policy.adapters.interface import ACTION_FIELDS, read_interface
+from policy.contract import ACTION_NAMES, Contract
 from policy.errors import ContractError
 
 CAMERA = "observation.images.front"
@@ -101,6 +101,19 @@ def test_names_are_guessed_by_their_spelling_and_marked(tmp_path: Path) -> None:
     assert tomllib.loads(path.read_text())["state"]["names"] == ["vx_mps", "vy_mps", "az_mps2"]
     text = " ".join(line.removeprefix("# ") for line in path.read_text().splitlines())
     assert "GUESSED: the dataset's meta/info.json calls them Vel_X, vy, acc_z" in text
+
+
+@pytest.mark.parametrize(
+    ("names", "term"), [(ACTION_NAMES, "full_lean_deg"), (ACTION_FIELDS["rates"], "hover_thrust")]
+)
+def test_gains_that_no_dataset_tells_are_guesses_to_check(
+    tmp_path: Path, names: Sequence[str], term: str
+) -> None:
+    status, said = told_by("contract", dataset(tmp_path, ["vx", "vy", "vz"], names))
+    assert status == 0
+    assert term in said[said.index("please check: ") :].splitlines()[0]
+    written = tomllib.loads((tmp_path / "mavbridge.toml").read_text())["contract"]
+    assert written[term] == getattr(Contract(), term)
 
 
 @pytest.mark.parametrize("state", [["vx", "battery", "vz"], None, ["vx"]])
