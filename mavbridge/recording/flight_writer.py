@@ -235,7 +235,7 @@ class FlightWriter:
             ticks=self._ticks.rows,
             frames=first.video.written if is_whole else None,
             ticks_dropped=self._serials.dropped,
-            frames_dropped=first.serials.next - first.video.written,
+            frames_dropped=sum(each.serials.next - each.video.written for each in self._cameras),
         )
         write_meta(self._folder, self.meta)
 

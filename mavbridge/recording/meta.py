@@ -56,7 +56,7 @@ class FlightMeta:
     ticks_dropped: int | None = None
     frames_dropped: int | None = None
     packets_dropped: int | None = None
-    """Each ``*_dropped`` counts the losses before the last row of its file."""
+    """Each ``*_dropped`` counts the losses before the last row of its files, of all cameras."""
     success: bool | None = None
     """True if the flight is an example to follow: by the pilot's mark, else by course and outcome.
     False after a crash or a fault."""

@@ -77,7 +77,7 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
         assert [number_of(rgb) for rgb in back.images()] == numbers
         assert [row.dropped_before for row in back.frame_rows()] == dropped
     meta = first.meta
-    assert (meta.frames, meta.ticks_dropped, meta.frames_dropped) == (3, 3, 3)
+    assert (meta.frames, meta.ticks_dropped, meta.frames_dropped) == (3, 3, 3 + 1)
     assert sorted(path.name for path in folder.iterdir()) == [
         *("camera.mp4", "camera_down.mp4", "frames.parquet", "frames_down.parquet"),
         *("meta.json", "ticks.parquet"),
