@@ -134,6 +134,14 @@ class Episode:
         meta = self.recorder.meta
         return meta if self.mark is None else replace(meta, success=self.mark == "good")
 
+    @property
+    def obstacle(self) -> str | None:
+        """Why recording cannot go on, for the report of its end; None if it can."""
+        crash, failure = self.recorder.crash, self.recorder.failure
+        if failure is not None:
+            return f"an error ({failure})"
+        return None if crash is None else f"a crash ({crash})"
+
     def emit(self, event: Event) -> None:
         """Record events since the start of the episode, numbered from there."""
         at_ns = event.woke_ns if isinstance(event, Tick) else event.captured_ns

@@ -259,9 +259,9 @@ class _Session:
     def _follow(self) -> None:
         """Begin or end an episode as the control wants it."""
         control, episode = self._control, self._episodes.current
-        if episode is not None and (crash := episode.recorder.crash) is not None:
+        if episode is not None and (obstacle := episode.obstacle) is not None:
             control.wanted = None
-            self._episodes.end(f"a crash ({crash})")
+            self._episodes.end(obstacle)
         elif episode is not None and control.wanted is None:
             self._episodes.end(control.ended_by)
         if control.wanted is None:
