@@ -7,9 +7,11 @@ the size and content of the graph before the slow conversion begins. A built-in 
 its configuration and weights.
 """
 
+import builtins
 import contextlib
 import hashlib
 import logging
+import math
 import operator
 import re
 import warnings
@@ -53,6 +55,7 @@ _READS = frozenset(
 )
 """Functions that give Python the value of a tensor, or a size that depends on values; a trace would
 silently freeze it."""
+_OF_PYTHON = min, max, math.pow
 MAX_OPERATIONS = 4000
 """Largest number of operations in one graph, 3 ms each to convert; ten unrolled steps of a TOGE are
 2,700, one is 500."""
@@ -144,9 +147,10 @@ def _float_tensor(result: object) -> Tensor:
     return result.float()
 
 
-def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgram:
+def _exported(module: "Traceable", examples: tuple[Tensor, ...]) -> ExportedProgram:
+    exportable = Traceable(module.held, _by_pythons_own(module.function))
     try:
-        program = torch.export.export(module, examples, strict=False)
+        program = torch.export.export(exportable, examples, strict=False)
     except PolicyError:
         raise
     except Exception as error:
@@ -162,6 +166,23 @@ def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgra
             if node.target is torch.ops.aten.item.default:
                 raise PolicyError(_DECIDES)
     return program
+
+
+def _by_pythons_own(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with Python's ``min``, ``max`` and ``math.pow``, as a trace calls them.
+
+    ``torch.export`` replaces them by others, which do not decide by values.
+    """
+
+    def call(*arrays: Tensor) -> Any:
+        replaced = builtins.min, builtins.max, math.pow
+        builtins.min, builtins.max, math.pow = _OF_PYTHON
+        try:
+            return function(*arrays)
+        finally:
+            builtins.min, builtins.max, math.pow = replaced
+
+    return call
 
 
 def _shared(node: fx.Node) -> str:

@@ -210,6 +210,12 @@ class Deciding(TwoRates):
         return chunk if state[0, 2] < 100 else -chunk
 
 
+class DecidingByMin(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk * min(state[0, 2], torch.tensor(100.0))
+
+
 class Reading(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         chunk = super().predict_fast(feature, state, history, steps)

@@ -50,6 +50,7 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("Drawing", "the same inputs do not give the same chunk again"),
         ("Resetting", "the policy has reset"),
         ("Deciding", "it decides by the values of a tensor"),
+        ("DecidingByMin", "it decides by the values of a tensor"),
         ("Reading", "it decides by the values of a tensor"),
         ("ReadingWritten", "it decides by the values of a tensor"),
         ("ScriptedDeciding", "it decides by the values of a tensor"),
