@@ -260,28 +260,3 @@ Event: TypeAlias = Tick | VisionTick
 """Events that the loops report to every observer."""
 Observed: TypeAlias = Event | Solve
 """Events that the recorder and the viewer take in addition."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RolloutFrame:
-    """One frame of an imagined flight, without its pixels."""
-
-    number: int
-    """Frame number in the video."""
-    iteration: int
-    frame: int
-    """Frame number within its iteration."""
-    executed: bool
-    """True if the next decision was made after this frame; False if it was only looked at."""
-    step: int
-    """Steps since the newest real frame. Iterations may overlap."""
-    frame_dt_s: float
-    state: FloatArray
-    """State [13]."""
-    action: FloatArray
-    """Action [4], the mean stick of the step before this frame."""
-
-    @property
-    def time_s(self) -> float:
-        """Time since the newest real frame [s]."""
-        return self.step * self.frame_dt_s

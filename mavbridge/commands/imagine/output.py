@@ -26,7 +26,7 @@ from mavbridge.commands.imagine.loop import (
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.core.records import ImageArray
 from mavbridge.core.workers import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
@@ -45,7 +45,7 @@ SCHEMA = pa.schema(
         pa.field("action", pa.list_(pa.float32(), ACTION_DIM), nullable=False),
     ]
 )
-"""Columns described in docs/formats.md, named after the attributes of ``RolloutFrame``."""
+"""Columns described in docs/formats.md."""
 
 
 def prepare_out(out: Path) -> None:
@@ -183,38 +183,35 @@ class StreamedOutput:
             raise
 
     def _write(self, segment: Segment, ready: torch.cuda.Event | None) -> None:
-        plan = self._plan
-        frames = [
-            RolloutFrame(
-                number=segment.iteration * plan.frames + row,
-                iteration=segment.iteration,
-                frame=row,
-                executed=row < plan.exe_steps,
-                step=segment.iteration * plan.exe_steps + row + 1,
-                frame_dt_s=self._frame_dt_s,
-                state=segment.states[row],
-                action=segment.actions[row],
-            )
-            for row in range(plan.frames)
-        ]
+        plan, first_step = self._plan, segment.iteration * self._plan.exe_steps + 1
         # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
         with writing(self._table_path):
-            for frame in frames:
-                self._table.add({name: getattr(frame, name) for name in SCHEMA.names})
+            for row in range(plan.frames):
+                self._table.add(
+                    {
+                        "iteration": segment.iteration,
+                        "frame": row,
+                        "executed": row < plan.exe_steps,
+                        "time_s": (first_step + row) * self._frame_dt_s,
+                        "state": segment.states[row],
+                        "action": segment.actions[row],
+                    }
+                )
             self._table.flush()
         missing = [row for row in range(plan.frames) if row not in segment.decoded]
         images = self._decoded(segment.latents, missing, ready)
-        for frame in frames:
+        for row in range(plan.frames):
             if self._stop.is_set():
                 return
             if self.video is not None:
-                rgb = segment.decoded.get(frame.frame)
+                rgb = segment.decoded.get(row)
                 if rgb is None:
                     rgb = next(images)
+                number = segment.iteration * plan.frames + row
                 # Frames of the video are evenly spaced.
-                at_ns = round(frame.number * frame.frame_dt_s * NS_PER_S)
-                row = FrameRow(frame_id=frame.number, captured_ns=at_ns, ready_ns=at_ns)
-                self.video.submit(rgb, row)
+                at_ns = round(number * self._frame_dt_s * NS_PER_S)
+                frame = FrameRow(frame_id=number, captured_ns=at_ns, ready_ns=at_ns)
+                self.video.submit(rgb, frame)
                 self._digest.update(np.ascontiguousarray(rgb).data)
             self.frames += 1
 
