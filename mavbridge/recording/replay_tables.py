@@ -2,16 +2,16 @@
 
 import json
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
-import numpy as np
 import pyarrow as pa
 
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording.rows import STATE_STAMPS, attributes, read_reason
-from mavbridge.recording.tables import Row
+from mavbridge.recording.rows import STATE_STAMPS, attributes, columns, read_reason
+from mavbridge.recording.tables import Row, table_rows
 from policy.contract import ACTION_DIM, STATE_DIM, Contract
 
 _NUMBERS = pa.list_(pa.float32())
@@ -19,11 +19,7 @@ _SOLVE = ("serial", "started_ns", "computed_ns", "reset_ns", "image_ns", "first_
 _ARRAYS = ("states", "history", "actions")
 _FEATURE = ("frame_id", "captured_ns", "ready_ns")
 _V1 = 0xFE
-
-
-def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
-    return [pa.field(name, kind, nullable=False) for name in names]
-
+_required = partial(columns, nullable=False)
 
 SOLVES = pa.schema(
     [
@@ -117,7 +113,7 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
         "history": (1, -1, ACTION_DIM),
         "actions": (1, -1, ACTION_DIM),
     }
-    for row in _rows(table, (*_ARRAYS, "state")):
+    for row in table_rows(table, (*_ARRAYS, "state")):
         state = VehicleState(
             values=row["state"],
             extras=tuple(row["extras"]),
@@ -135,7 +131,7 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
 
 def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
     """Return the records of a table of features, each with its value [1, F]. Read-only."""
-    for row in _rows(table, ("value",)):
+    for row in table_rows(table, ("value",)):
         stored = {"code": None, "data": {}} if row["fault"] is None else json.loads(row["fault"])
         fault = read_reason(stored["code"], json.dumps(stored["data"]))
         stamps = {name: row[name] for name in _FEATURE}
@@ -144,16 +140,5 @@ def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
 
 def read_packets(table: pa.Table) -> Iterator[PacketStamp]:
     """Return the records of a table of packets."""
-    for row in _rows(table, ()):
+    for row in table_rows(table):
         yield PacketStamp(**{name: row[name] for name in PacketStamp._fields})
-
-
-def _rows(table: pa.Table, arrays: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-    """Yield rows by column; ``arrays`` name those of float32, which become read-only arrays."""
-    for batch in table.to_batches():
-        plain = batch.drop_columns(list(arrays)).to_pylist()
-        for number, row in enumerate(plain):
-            for name in arrays:
-                row[name] = np.asarray(batch.column(name)[number].values, np.float32)
-                row[name].setflags(write=False)
-            yield row

@@ -9,14 +9,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
 import pyarrow as pa
 
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from mavbridge.recording.meta import FlightError
-from mavbridge.recording.tables import Row
+from mavbridge.recording.tables import Row, table_rows
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -67,25 +66,26 @@ STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
 _TRUTH = tuple(field.name for field in fields(FrameTruth))
 
 
-def _fields(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
+def columns(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
+    """Return fields of one type."""
     return [pa.field(name, kind, nullable=nullable) for name in names]
 
 
 TICKS = pa.schema(
     [
-        *_fields(pa.int64(), "index", "due_ns", "woke_ns", "sent_ns", nullable=False),
+        *columns(pa.int64(), "index", "due_ns", "woke_ns", "sent_ns", nullable=False),
         pa.field("missed_slots", pa.int32(), nullable=False),
-        *_fields(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
+        *columns(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
         pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
-        *_fields(pa.int64(), *STATE_STAMPS),
-        *_fields(_STICKS, *ActionTrace._fields, "sent", "rc_sticks"),
+        *columns(pa.int64(), *STATE_STAMPS),
+        *columns(_STICKS, *ActionTrace._fields, "sent", "rc_sticks"),
         pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
-        *_fields(pa.string(), "release_reason", "release_code", "release_data", "mode"),
+        *columns(pa.string(), "release_reason", "release_code", "release_data", "mode"),
         pa.field("armed", pa.bool_(), nullable=False),
         pa.field("texts", pa.list_(pa.string()), nullable=False),
         pa.field("dropped_before", pa.int32(), nullable=False),
-        *_fields(pa.bool_(), "is_slot", "is_coasting", nullable=False),
-        *_fields(pa.int64(), "chunk_serial", "chunk_computed_ns"),
+        *columns(pa.bool_(), "is_slot", "is_coasting", nullable=False),
+        *columns(pa.int64(), "chunk_serial", "chunk_computed_ns"),
         pa.field("phase", pa.string()),
         pa.field("position_ned_m", _VECTOR),
         pa.field("decided_ns", pa.int64()),
@@ -93,7 +93,7 @@ TICKS = pa.schema(
 )
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
-_FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
+_FRAME_STAMPS = columns(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
 FRAMES = pa.schema([*_FRAME_STAMPS, pa.field("dropped_before", pa.int32(), nullable=False)])
 DEMONSTRATION_FRAMES = pa.schema(
     [
@@ -115,7 +115,6 @@ _TICK = tuple(
     if field.name in TICKS.names and field.name != "release_reason"
 )
 """Columns that hold a ``Tick`` attribute unchanged."""
-_ROWS_AT_ONCE = 4096
 
 
 def tick_columns(row: TickRow) -> Row:
@@ -156,8 +155,6 @@ def attributes(source: object | None, names: Iterable[str]) -> Row:
 def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
     """Return the records of a table of ticks whose actions are of this kind.
 
-    Whole columns are never converted to Python objects at once.
-
     Raises:
         FlightError: a part of a state or of an action is missing.
     """
@@ -167,7 +164,7 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
             raise FlightError(f"ticks have {whole} without {', '.join(torn)}: see docs/formats.md")
     serial, make = -1, ACTION_CLASSES[action]
     readonly = table.column("sent").null_count == table.num_rows
-    for row in _rows(table):
+    for row in table_rows(table, ("state",)):
         serial += 1 + row["dropped_before"]
         expert, tick = row.get("expert"), _tick(row, serial, make, readonly=readonly)
         yield TickRow(tick, row["dropped_before"], expert and make(*expert))
@@ -175,18 +172,13 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:
     """Return the records of a table of frames."""
-    for row in _rows(table):
+    for row in table_rows(table):
         truth = None
         if row.get("position_ned_m") is not None:
             values: dict[str, Any] = {name: row[name] for name in _TRUTH}
             lists = {name: tuple(v) for name, v in values.items() if isinstance(v, list)}
             truth = FrameTruth(**(values | lists))
         yield FrameRow(**{name: row[name] for name in FRAMES.names}, truth=truth)
-
-
-def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
-    for batch in table.to_batches(max_chunksize=_ROWS_AT_ONCE):
-        yield from batch.to_pylist()
 
 
 def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: bool) -> Tick:
@@ -199,9 +191,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: boo
         values["position_ned_m"] = Position(*row["position_ned_m"])
     state, trace = None, None
     if row["state"] is not None:
-        array = np.array(row["state"], np.float32)
-        array.setflags(write=False)
-        state = VehicleState(values=array, **{name: row[name] for name in STATE_STAMPS})
+        state = VehicleState(values=row["state"], **{name: row[name] for name in STATE_STAMPS})
     if row["raw"] is not None:
         trace = ActionTrace(**{name: make(*row[name]) for name in ActionTrace._fields})
     values |= {"serial": serial, "state": state, "trace": trace, "readonly": readonly}

@@ -1,7 +1,7 @@
 """Tables that survive a crash: Arrow IPC streams while they grow, Parquet when complete."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,6 +20,7 @@ FLUSH_NS = 500_000_000
 """Longest span of events that a crash can lose."""
 READ_ERRORS = (pa.ArrowException, OSError)
 _ADVICE = "another program or version wrote it"
+_ROWS_AT_ONCE = 4_096
 _GROUP_ROWS = 2_048
 """Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
 
@@ -111,6 +112,20 @@ def count_lost(table: pa.Table, numbers: NDArray[np.int64]) -> pa.Table:
     column = table.schema.get_field_index("dropped_before")
     counts = table.column(column).to_numpy() + lost
     return table.set_column(column, table.field(column), pa.array(counts.astype(np.int32)))
+
+
+def table_rows(table: pa.Table, arrays: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
+    """Yield rows by column; ``arrays`` name those of numbers, which become read-only arrays.
+
+    Whole columns are never converted to Python objects at once.
+    """
+    for batch in table.to_batches(max_chunksize=_ROWS_AT_ONCE):
+        plain = batch.drop_columns(list(arrays)).to_pylist()
+        for number, row in enumerate(plain):
+            for name in arrays:
+                values = batch.column(name)[number].values
+                row[name] = None if values is None else values.to_numpy()  # read-only
+            yield row
 
 
 def table_exists(stem: Path) -> bool:
