@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.files import write_durably
 from mavbridge.core.reasons import reason_from_json
 from mavbridge.core.records import FlightOutcome
 from mavbridge.recording.folder import META
@@ -105,18 +106,11 @@ class FlightMeta:
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
-    """Write or replace ``meta.json`` atomically; raise OSError if that fails."""
+    """Write or replace ``meta.json``; raise OSError if that fails."""
     document = {"format": FORMAT, "version": VERSION} | asdict(meta)
     if meta.outcome is not None:
         document["outcome"] = meta.outcome.to_json()
-    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    part = folder / f"{META}.part"
-    try:
-        part.write_text(text)
-        part.replace(folder / META)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
+    write_durably(folder / META, json.dumps(document, indent=2, allow_nan=False) + "\n")
 
 
 def read_meta(folder: Path) -> FlightMeta:
