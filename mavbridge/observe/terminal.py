@@ -97,17 +97,17 @@ class FlightScreen:
         self._worker = Worker("mavbridge-terminal", self._run)
         self._worker.start()
 
-    def close(self, timeout_s: float) -> bool:
+    def close(self, timeout_s: float) -> None:
         """Print pending messages and the report, and stop. Works twice, and without ``start``.
 
-        Return False if the reader did not take the text within the timeout. The rest is then
-        dropped; do not use standard error afterwards, which would block, too (``end_process``).
+        Text that the reader did not take within the timeout is dropped; do not use standard error
+        afterwards, which would block, too (``end_process``).
         """
         worker, self._worker = self._worker, None
         self._redirection.close()
         if worker is None:
             if not self._messages:
-                return True
+                return
             worker = Worker("mavbridge-terminal", self._run)
             worker.start()
         try:
@@ -116,8 +116,6 @@ class FlightScreen:
             if isinstance(self._console.file, PatientOutput):
                 self._console.file.give_up()
                 worker.ends_within(timeout_s)
-            return False
-        return True
 
     def emit(self, event: Event) -> None:
         """Store the event and its messages."""

@@ -6,10 +6,9 @@ died. ``mavbridge.mavlink.codec.tlog`` makes them.
 
 import os
 import threading
-from io import FileIO
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
-from typing import NamedTuple, Never
+from typing import BinaryIO, NamedTuple, Never
 
 PERIOD_S = 0.05
 """Time between two reads. Waking the reader for each record would cost the link's process time."""
@@ -59,20 +58,19 @@ class TlogThread:
 
     def _run(self) -> None:
         try:
-            with self._job.records, self._job.path.open("xb", buffering=0) as file:
+            with self._job.records, self._job.path.open("xb") as file:
                 while not self._stop.is_set() and self._copy(file):
                     self._stop.wait(PERIOD_S)
         except OSError as error:
             self.failure = error
 
-    def _copy(self, file: FileIO) -> bool:
+    def _copy(self, file: BinaryIO) -> bool:
         """Append the pending data of the pipe; return False at its end."""
         if not wait([self._job.records], PERIOD_S):
             return True
         data = os.read(self._job.records.fileno(), READ_BYTES)
-        at = 0
-        while at < len(data):
-            at += file.write(data[at:])
+        file.write(data)
+        file.flush()
         return bool(data)
 
     def finish(self, timeout_s: float) -> None:

@@ -55,10 +55,6 @@ class MemoryTransport(Transport):
         for arrived_ns, data in self._from_vehicle.receive():
             yield Received(data, arrived_ns, VEHICLE)
 
-    def receiver(self, peer: Address | None) -> Address | None:
-        """See ``Transport``."""
-        return peer
-
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one packet; always succeeds."""
         self._to_vehicle.send(data)

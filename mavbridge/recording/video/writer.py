@@ -88,7 +88,7 @@ class VideoWriter:
         """Height and width of the recorded frames; None before the first."""
         return None if self._ring is None else (self._ring.shape.height, self._ring.shape.width)
 
-    def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
+    def submit(self, rgb: CameraImage, row: FrameRow) -> None:
         """Hand a frame over; the caller can overwrite it afterwards.
 
         A frame that differs in size or kind from the first, or is one pixel high or wide, is a bug
@@ -97,9 +97,6 @@ class VideoWriter:
         Args:
             rgb: the image. An odd last row or column is cut off, which H.264 cannot have.
             row: other facts about the frame; drops of the ring are added to ``dropped_before``.
-
-        Returns:
-            True if it was taken.
         """
         self._receive()
         height, width = rgb.shape[:2]
@@ -112,12 +109,11 @@ class VideoWriter:
             self._wait_until(lambda: bool(self._free))
         if ring is None or not self._free:
             self._pending_drops += 1 + row.dropped_before
-            return False
+            return
         slot = self._free.popleft()
         ring.slot(slot)[:] = rgb
         dropped, self._pending_drops = row.dropped_before + self._pending_drops, 0
         self._send(Submit(slot, replace(row, dropped_before=dropped)))
-        return True
 
     def _see_misfit(self, height: int, width: int) -> None:
         if self.size is None:

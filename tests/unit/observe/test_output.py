@@ -28,7 +28,7 @@ def test_a_reader_who_comes_back_gets_everything() -> None:
             screen.show_message(text)
         assert [lines.readline().rstrip("\n") for _ in texts] == texts
         screen.show_report(report_of(make_tick(0)))
-        assert screen.close(60.0)
+        screen.close(60.0)
 
 
 def test_a_reader_who_is_gone_is_written_to_no_more() -> None:

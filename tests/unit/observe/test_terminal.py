@@ -154,12 +154,12 @@ def test_close_prints_what_is_left_and_may_be_called_again() -> None:
     screen.start(hint="e engages")
     screen.show_message("the last message")
     screen.show_report(report_of(*(make_tick(index) for index in range(11))))
-    assert screen.close(60.0)
+    screen.close(60.0)
     assert out.getvalue().startswith("e engages\nthe last message\n")
     assert "toge-small on torch, ardupilot" in out.getvalue()
     assert "100.0 Hz of 100 Hz" in out.getvalue()
     shown = out.getvalue()
-    assert screen.close(60.0)
+    screen.close(60.0)
     assert out.getvalue() == shown
 
 
