@@ -44,8 +44,7 @@ from mavbridge.simulation.replay.compare import (
     compare_guard,
     compare_policy,
     forgotten,
-    guard_traces,
-    other_traces,
+    stick_traces,
 )
 from mavbridge.simulation.replay.guard import (
     recorded_plan,
@@ -100,10 +99,10 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             for pair in pairs
             if pair.replayed is not None
         }
-    traces = guard_traces(steps)
+    traces = stick_traces(steps, (step.replayed for step in steps))
     is_same = compared is None or compared.equal_chunks == compared.solves
     if wanted.limits != source.config.limits or not is_same:
-        traces = other_traces(steps, replay_other(steps, plan.guard, chunks))
+        traces = stick_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
         names = source.contract.cameras
         damage = [text for name in names for text in open_flight(folder, name).damage]

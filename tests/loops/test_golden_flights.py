@@ -23,7 +23,7 @@ from mavbridge.simulation.replay.compare import (
     PolicyComparison,
     compare_guard,
     compare_policy,
-    other_traces,
+    stick_traces,
 )
 from mavbridge.simulation.replay.guard import (
     recorded_plan,
@@ -116,7 +116,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
     }
     steps = through_gate("toge_ardupilot")
     outputs = replay_other(steps, recorded_plan(source).guard, chunks)
-    assert other_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
+    assert stick_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
 
 
 def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
@@ -135,7 +135,7 @@ def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     frame = action_frame(source.contract)
     chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
 
-    traces = other_traces(steps, replay_other(steps, recorded_plan(source).guard, chunks))
+    traces = stick_traces(steps, replay_other(steps, recorded_plan(source).guard, chunks))
 
     assert traces.deviation.most == 0
 

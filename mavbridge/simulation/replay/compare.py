@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, ActionTrace
-from mavbridge.guard.guard import GuardOutput
 from mavbridge.guard.wire import GuardTick
 from mavbridge.recording.rows import STATE_STAMPS, attributes
 from mavbridge.simulation.replay.guard import GuardStep
@@ -167,7 +166,7 @@ def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
         flown=sum(step.recorded.trace is not None for step in steps),
         differ=dict(differ),
         first=first,
-        deviation=guard_traces(steps).deviation,
+        deviation=stick_traces(steps, (step.replayed for step in steps)).deviation,
     )
 
 
@@ -190,22 +189,15 @@ def _single(action: Action | None) -> list[float] | None:
     return None if action is None else np.array(action, np.float32).tolist()
 
 
-def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:
-    """Return the sticks from the recorded chunks."""
-    return _traces(steps, [step.replayed.trace if step.replayed else None for step in steps])
-
-
-def other_traces(steps: Sequence[GuardStep], outputs: Iterable[GuardOutput]) -> StickTraces:
-    """Return the sticks from other chunks or other settings."""
-    return _traces(steps, [output.tick.trace for output in outputs])
-
-
-def _traces(steps: Sequence[GuardStep], traces: Sequence[ActionTrace | None]) -> StickTraces:
+def stick_traces(steps: Sequence[GuardStep], replayed: Iterable[GuardTick | None]) -> StickTraces:
+    """Return the sticks of these ticks, which may be of other chunks or other settings."""
     begin_ns = steps[0].recorded.sent_ns
     return StickTraces(
         times_s=np.array([(step.recorded.sent_ns - begin_ns) / 1e9 for step in steps]),
         recorded=np.array([_smoothed(step.recorded.trace) for step in steps], np.float64),
-        replayed=np.array([_smoothed(trace) for trace in traces], np.float32).astype(np.float64),
+        replayed=np.array([_smoothed(tick and tick.trace) for tick in replayed], np.float32).astype(
+            np.float64
+        ),
     )
 
 

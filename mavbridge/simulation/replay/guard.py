@@ -22,7 +22,7 @@ from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.settings import link_settings
 from mavbridge.guard.chunks import GRACE_PERIODS, LEAST_GRACE_NS, MAX_REFUSED, Chunk
-from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
+from mavbridge.guard.guard import Guard, GuardInput
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
@@ -157,8 +157,8 @@ def replay_other(
     steps: Sequence[GuardStep],
     settings: FlightSettings,
     chunks: Mapping[int, Chunk],
-) -> Iterator[GuardOutput]:
-    """Replay other chunks or settings through the guard. Yield one output for each of ``steps``.
+) -> Iterator[GuardTick]:
+    """Replay other chunks or settings through the guard. Yield one tick for each of ``steps``.
 
     The vehicle's answers are those to the recorded sticks, so the link is not run; its recorded
     snapshots are used. The resulting sticks are those of the policy's trace, before the message.
@@ -175,12 +175,10 @@ def replay_other(
                 guard.step(told_ns, GuardInput(link=step.snapshot, absence=reason))
             else:
                 absence = reason
-        yield guard.step(
-            at_ns,
-            GuardInput(
-                link=step.snapshot, chunk=chunk, absence=absence, act=step.act, stop=step.stop
-            ),
+        given = GuardInput(
+            link=step.snapshot, chunk=chunk, absence=absence, act=step.act, stop=step.stop
         )
+        yield guard.step(at_ns, given).tick
 
 
 def _arrivals(
