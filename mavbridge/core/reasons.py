@@ -4,10 +4,11 @@ Code branches on ``Reason.code``, recordings store it and tests compare it. The 
 ``str(reason)``, is for people only.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from functools import partial
+from itertools import chain
 from typing import Any, Self, TypeAlias
 
 Value: TypeAlias = "str | int | float | bool | Reason"
@@ -323,7 +324,8 @@ class Reason:
     @property
     def codes(self) -> tuple[Code, ...]:
         """Code of this reason and of those inside it."""
-        return tuple(self._codes())
+        inner = [value.codes for _, value in self.data if isinstance(value, Reason)]
+        return (self.code, *chain.from_iterable(inner))
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -334,12 +336,6 @@ class Reason:
             if isinstance(value, str | Reason)
         ]
         return self.code, *words
-
-    def _codes(self) -> Iterator[Code]:
-        yield self.code
-        for _, value in self.data:
-            if isinstance(value, Reason):
-                yield from value.codes
 
     def __str__(self) -> str:
         """Return the sentence for the user."""

@@ -72,7 +72,8 @@ class RerunView:
         if batch and not self._has_start:
             self._has_start = True
             firsts: tuple[Observed, ...] = (*ticks[:1], *visions[:1], *solves[:1])
-            self._begin(_happened_ns(firsts[0]))
+            self._columns.start_ns = _happened_ns(firsts[0])
+            self._mark(self._columns.start_ns)
         stamps_ns = (*(tick.sent_ns for tick in ticks), *(each.ready_ns for each in visions))
         self._until_ns = max((self._until_ns, *stamps_ns))
         if ticks:
@@ -110,11 +111,6 @@ class RerunView:
         for path, style in layout.styles(self._flight.contract.action):
             self._recording.stream.log(path, style, static=True, strict=True)
         self._scene.open()
-
-    def _begin(self, start_ns: int) -> None:
-        """Start the timeline."""
-        self._columns.start_ns = start_ns
-        self._mark(start_ns)
 
     def _mark(self, stamp_ns: int) -> None:
         """Show a gap in every plot, so that all of them reach as far."""
