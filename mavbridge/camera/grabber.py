@@ -71,24 +71,14 @@ class Grabber:
         self._stopping = threading.Event()
         self._newest: Frame | None = None
         self._frame_count = 0
-        self._dropped_frames = 0
+        self.dropped_frames = 0
+        """Number of frames replaced by a newer one before they were read."""
         self._failure: CameraError | None = None
-        self._waiting_reason = "it is being opened"
+        self.waiting_reason = "it is being opened"
+        """Known reason why there is no frame yet."""
         self._silent_after_ns: int | None = None
         self._thread = threading.Thread(target=self._run, name="mavbridge-camera", daemon=True)
         self._thread.start()
-
-    @property
-    def dropped_frames(self) -> int:
-        """Number of frames replaced by a newer one before they were read."""
-        with self._changed:
-            return self._dropped_frames
-
-    @property
-    def waiting_reason(self) -> str:
-        """Known reason why there is no frame yet."""
-        with self._changed:
-            return self._waiting_reason
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.ports.Camera`."""
@@ -131,8 +121,7 @@ class Grabber:
                 reason = str(error)
             if self._frame_count == 0 or self._frame_count > frames_before:
                 delays_s = iter(self._reopen_delays_s)
-            with self._changed:
-                self._waiting_reason = reason
+            self.waiting_reason = reason
             delay_s = next(delays_s, None)
             if delay_s is None:
                 attempts = len(self._reopen_delays_s)
@@ -142,10 +131,9 @@ class Grabber:
 
     def _open(self) -> ImageSource:
         source = self._open_source()
-        with self._changed:
-            self._waiting_reason = "it is open, and has delivered no frame yet"
-            if self._frame_count > 0:
-                self._silent_after_ns = self._clock.now_ns() + REOPENED_NS
+        self.waiting_reason = "it is open, and has delivered no frame yet"
+        if self._frame_count > 0:
+            self._silent_after_ns = self._clock.now_ns() + REOPENED_NS
         return source
 
     def _drain(self, source: ImageSource) -> str:
@@ -158,7 +146,7 @@ class Grabber:
                 rgb.flags.writeable = False
                 with self._changed:
                     self._frame_count += 1
-                    self._dropped_frames += self._newest is not None
+                    self.dropped_frames += self._newest is not None
                     self._newest = Frame(
                         frame_id=self._frame_count,
                         captured_ns=captured_ns,
@@ -170,7 +158,6 @@ class Grabber:
         except CameraError as error:
             return str(error)
         finally:
-            with self._changed:
-                self._silent_after_ns = None
+            self._silent_after_ns = None
             source.close()
         return "closed"
