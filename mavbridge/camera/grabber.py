@@ -158,6 +158,7 @@ class Grabber:
         except CameraError as error:
             return str(error)
         finally:
-            self._silent_after_ns = None
+            with self._changed:  # ``read`` looks at it twice
+                self._silent_after_ns = None
             source.close()
         return "closed"
