@@ -9,7 +9,6 @@ from itertools import repeat
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import UserError
 
 _Z99 = 2.3263478740408408
 """Standard deviations below which 99 % of a normal distribution lie."""
@@ -28,13 +27,6 @@ class Delay:
     p99_ns: int | None = None
     """None = every sample is p50_ns."""
     offset_ns: int = 0
-
-    def __post_init__(self) -> None:
-        """Raise UserError for negative times or percentiles that no log-normal distribution has."""
-        if min(self.p50_ns, self.offset_ns) < 0:
-            raise UserError(f"a delay cannot be negative, got {self}")
-        if self.p99_ns is not None and not 0 < self.p50_ns <= self.p99_ns:
-            raise UserError(f"a log-normal delay needs 0 < p50 <= p99, got {self}")
 
     def samples_ns(self, random: np.random.Generator) -> Iterator[int]:
         """Yield independent samples without end."""

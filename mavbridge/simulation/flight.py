@@ -65,8 +65,9 @@ class SimulationSettings:
 class SimulatedFlight:
     """One flight of a vehicle over a course, flown by the bridge.
 
-    The same arguments give the same stick bytes. Add watchers before ``fly``. A scripted policy
-    follows ``clock``; ``vehicle.ap.truth`` is the true state at any time, even within ``act``.
+    The same arguments give the same stick bytes. Fly it once, and add watchers before. A scripted
+    policy follows ``clock``; ``vehicle.ap.truth`` is the true state at any time, even within
+    ``act``.
     """
 
     def __init__(
@@ -80,14 +81,9 @@ class SimulatedFlight:
     ) -> None:
         """Put the vehicle on the course of ``sitl.course.make_course``.
 
-        ``seed`` determines the delays and the phases of vehicle and camera; the vehicle's
-        conditions also determine the look of the course.
-
-        Raises:
-            UserError: ``seed`` is negative.
+        ``seed``, 0 or more, determines the delays and the phases of vehicle and camera; the
+        vehicle's conditions also determine the look of the course.
         """
-        if seed < 0:
-            raise UserError(f"a seed is a non-negative integer, got {seed}")
         self._settings = settings or SimulationSettings()
         self._course_seed = course_seed
         self._seed = seed
@@ -108,20 +104,14 @@ class SimulatedFlight:
         self._stepper = VehicleStepper(
             self.clock, self.vehicle, boot_ns, to_vehicle=uplink, from_vehicle=downlink
         )
-        self._exposure_watchers: list[Callable[[Exposure], None]] = []
-        self._has_flown = False
+        self.step_watchers = self._stepper.watchers
+        """Called after each step of the vehicle, every 2.5 ms."""
+        self.exposure_watchers: list[Callable[[Exposure], None]] = []
+        """Called at each exposure, including frames that are never read."""
 
     def _random(self, purpose: int) -> np.random.Generator:
         """Return random numbers for one purpose: changing one delay leaves the others alone."""
         return np.random.Generator(np.random.PCG64((self._seed, purpose)))
-
-    def watch_exposures(self, watch: Callable[[Exposure], None]) -> None:
-        """Call ``watch`` at each exposure, including frames that are never read."""
-        self._exposure_watchers.append(watch)
-
-    def watch_steps(self, watch: Callable[[], None]) -> None:
-        """Call ``watch`` after each step of the vehicle, every 2.5 ms."""
-        self._stepper.watchers.append(watch)
 
     def fly(
         self,
@@ -144,11 +134,7 @@ class SimulatedFlight:
             EpisodeInterruptedError: ``should_stop`` ended the flight.
             PeerError: the vehicle could not be engaged.
             PolicyError: the policy failed.
-            UserError: this flight was flown before.
         """
-        if self._has_flown:
-            raise UserError("a simulated flight is flown once: make another one")
-        self._has_flown = True
         cv2.setNumThreads(1)  # same images on any machine, and no thread pool to wake
         referee = Referee(
             self.clock,
@@ -158,7 +144,7 @@ class SimulatedFlight:
             stops=ends_by_stop and runner.contract.stops_at_end,
             should_stop=should_stop,
         )
-        self.watch_steps(referee.watch)
+        self.step_watchers.append(referee.watch)
         guard = self._compose(runner, (referee, *sinks))
         while not referee.stop.is_set():
             if referee.has_stopped:  # the autopilot holds the place for the rest of the run-out
@@ -256,7 +242,7 @@ class SimulatedFlight:
             )
             for number, name in enumerate(mounts)
         ]
-        cameras[0].exposure_watchers += self._exposure_watchers
+        cameras[0].exposure_watchers += self.exposure_watchers
         return cameras
 
     def _take_time(

@@ -48,7 +48,7 @@ def errors(state_time: Any, autopilot: Any) -> tuple[float, float]:
         row = (*body.velocity_ned_mps, *body.ned_from_body_wxyz)
         truth.append((flight.clock.now_ns(), np.array(row, np.float32)))
 
-    flight.watch_steps(watch)
+    flight.step_watchers.append(watch)
     contract = replace(runner.contract, state_time=state_time, play_s=0.4)
     flight.fly(replace(runner, contract=contract, act=act), max_time_s=10.0)
     times = [at_ns for at_ns, _ in truth]

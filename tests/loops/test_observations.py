@@ -182,7 +182,7 @@ def test_a_slow_policy_gets_the_states_between_its_solves() -> None:
     runner = make_numpy_runner(policy, ExecutionSettings(name="slow"))
     policy.calls.clear()
     north_mps: dict[int, float] = {}
-    one.watch_steps(
+    one.step_watchers.append(
         lambda: north_mps.update({one.clock.now_ns(): one.vehicle.ap.truth.velocity_ned_mps[0]})
     )
     one.fly(runner, max_time_s=6.0)

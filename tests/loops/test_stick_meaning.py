@@ -56,7 +56,7 @@ def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool
         if FLOWN_S - 1.0 < since_s() < FLOWN_S:
             seen.append(flight.vehicle.ap.truth)
 
-    flight.watch_steps(watch)
+    flight.step_watchers.append(watch)
     policy = flown_by_rates(steady(sticks)) if is_by_rates else steady(sticks)
     assert flight.fly(policy, max_time_s=FLOWN_S, sinks=(sink,)).outcome == "timed out"
     sent = [tick.sent for tick in sink.ticks if tick.trace is not None and tick.sent is not None]

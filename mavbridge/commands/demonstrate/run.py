@@ -152,7 +152,7 @@ class _LabelledRecorder:
         self._truths: dict[int, FrameTruth] = {}
         self._ticks = self._frames = 0
         self._chunk_serial = 0
-        flight.watch_exposures(self._keep_truth)
+        flight.exposure_watchers.append(self._keep_truth)
 
     def _keep_truth(self, exposure: Exposure) -> None:
         body = exposure.body
