@@ -1,6 +1,5 @@
 """Output shared by the commands: tables, progress bars and figures."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from rich.table import Table
 
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
-from mavbridge.core.files import require_writable, write_output
+from mavbridge.core.files import as_json, require_writable, write_output
 from mavbridge.core.provenance import without_secrets
 from mavbridge.observe.output import SafeConsole
 
@@ -61,11 +60,6 @@ def require_outputs(json_file: Path | None, plot: Path | None) -> None:
         require_packages("--plot", {"matplotlib": "matplotlib"})
 
 
-def as_json(document: object) -> str:
-    """Return the text of a ``--json`` file."""
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
-
-
 def write_json(path: Path | None, document: object) -> None:
     """Write the file that ``--json`` names, if it names one."""
     if path is not None:
@@ -101,11 +95,6 @@ def make_table(
     for row in rows:
         table.add_row(*row)
     return table
-
-
-def number(value: float | None, digits: int) -> str:
-    """Format a figure; a dash if it was not measured."""
-    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def print_status(line: str) -> None:

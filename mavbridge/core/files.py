@@ -1,6 +1,7 @@
 """File helpers: early checks of output paths, and durable writes."""
 
 import errno
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -70,6 +71,11 @@ def write_output(path: Path, text: str, flag: str) -> None:
             f"cannot write {flag} {path}: {error.strerror or error}; make room there, or name "
             "another file"
         ) from error
+
+
+def as_json(document: object) -> str:
+    """Return the text of a JSON file."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def write_durably(path: Path, text: str) -> None:

@@ -13,6 +13,7 @@ import mavbridge
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import as_json
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.ports import TickSink
 from mavbridge.core.provenance import (
@@ -31,7 +32,7 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
-from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
+from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_document
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.folder import remove_flight
@@ -232,6 +233,6 @@ class FlightObservers:
             self.screen.show_message(describe(outcome))
         if self._config.report is not None:
             try:
-                self._config.report.write_text(report_json(report))
+                self._config.report.write_text(as_json(report_document(report)))
             except OSError as error:  # a full disk, no more open files
                 self.screen.show_message(f"--report {self._config.report}: {error.strerror}")

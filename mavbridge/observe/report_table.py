@@ -7,7 +7,6 @@ from mavbridge.core.vehicle import LinkStats
 from mavbridge.observe.timing import TimingReport
 
 RELEASES_SHOWN = 3
-_NOT_MEASURED = "-"
 _STYLE_GOOD, _STYLE_POOR, _STYLE_BAD = "green", "yellow", "red"
 _LEGEND = (
     "stick lateness: from a slot of the stick grid to its send; a slot is missed when nothing was "
@@ -61,7 +60,7 @@ def verdicts(report: TimingReport) -> list[Text]:
     if vision.dropped_frames is not None:
         dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
     for name, loop, rest in (("action", action, late), ("vision", vision, dropped)):
-        text = f"{shown_rate(loop.rate_hz)} Hz of {loop.target_hz:.4g} Hz, {rest}"
+        text = f"{number(loop.rate_hz, 1)} Hz of {loop.target_hz:.4g} Hz, {rest}"
         lines.append(_line(name, text, rate_style(loop.rate_hz, loop.target_hz)))
     if report.link is not None:
         lines.append(_line("link", _link_verdict(report.link)))
@@ -107,9 +106,9 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def shown_rate(rate_hz: float | None) -> str:
-    """Format a rate with one decimal; a dash for None."""
-    return _NOT_MEASURED if rate_hz is None else f"{rate_hz:.1f}"
+def number(value: float | None, digits: int) -> str:
+    """Format a figure; a dash if it was not measured."""
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def shown_share(share: float, digits: int) -> str:

@@ -17,7 +17,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
 from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_shown
-from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
+from mavbridge.observe.report_table import number, rate_style, timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
 
 _said = logging.getLogger(SAID)
@@ -175,7 +175,7 @@ class FlightScreen:
             if name == "action" and tick.chunk_serial is None:
                 continue  # the policy may still compute, but does not fly
             line.append(f"  {name} ")
-            line.append(f"{shown_rate(rate_hz)} Hz", style=rate_style(rate_hz, target_hz))
+            line.append(f"{number(rate_hz, 1)} Hz", style=rate_style(rate_hz, target_hz))
         attitude_ns = None if tick.state is None else tick.state.attitude_ns
         line.append(f"  feature {_age(tick.sent_ns, tick.feature_captured_ns)}")
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
@@ -220,6 +220,5 @@ class FlightScreen:
 
 
 def _age(now_ns: int, stamp_ns: int | None) -> str:
-    if stamp_ns is None:
-        return f"{shown_rate(None)} ms"
-    return f"{(now_ns - stamp_ns) / NS_PER_MS:.0f} ms"
+    age_ms = None if stamp_ns is None else (now_ns - stamp_ns) / NS_PER_MS
+    return f"{number(age_ms, 0)} ms"

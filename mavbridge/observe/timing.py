@@ -1,6 +1,5 @@
 """Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
-import json
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -316,13 +315,11 @@ class _Span:
         return round((self.count - 1) / self.duration_s, 3) if self.duration_s > 0 else None
 
 
-def report_json(report: TimingReport) -> str:
-    """Return the report as JSON, with keys in the order of the dataclasses; null: not measured."""
-    return json.dumps(report_document(report), indent=2, allow_nan=False) + "\n"
-
-
 def report_document(report: TimingReport) -> dict[str, object]:
-    """Return the report as a JSON object for use in a larger document."""
+    """Return the report as a JSON object, with keys in the order of the dataclasses.
+
+    null: not measured.
+    """
     document = asdict(report)
     document["releases"] = [
         {"t_s": release.t_s, "reason": reason_to_json(release.reason)}

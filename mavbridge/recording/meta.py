@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.files import write_durably
+from mavbridge.core.files import as_json, write_durably
 from mavbridge.core.reasons import reason_from_json
 from mavbridge.core.records import FlightOutcome
 from mavbridge.recording.folder import META
@@ -110,7 +110,7 @@ def write_meta(folder: Path, meta: FlightMeta) -> None:
     document = {"format": FORMAT, "version": VERSION} | asdict(meta)
     if meta.outcome is not None:
         document["outcome"] = meta.outcome.to_json()
-    write_durably(folder / META, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_durably(folder / META, as_json(document))
 
 
 def read_meta(folder: Path) -> FlightMeta:

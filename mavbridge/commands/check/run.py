@@ -16,12 +16,12 @@ from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_
 from mavbridge.commands.check.soak import soak
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
-from mavbridge.commands.output import as_json, print_status, text_console, write_json
+from mavbridge.commands.output import print_status, text_console, write_json
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
-from mavbridge.core.files import empty_folders_removed, require_writable
+from mavbridge.core.files import as_json, empty_folders_removed, require_writable
 from mavbridge.core.realtime import settle_guard, usable_cores
 from mavbridge.flight.checks import file_checks, output_folders
 from mavbridge.flight.plan import FlightPlan

@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.policy import HELD
 from mavbridge.commands.check.rows import CheckRow
-from mavbridge.commands.output import number
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
@@ -30,6 +29,7 @@ from mavbridge.flight.guard_process import start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import patient_console
+from mavbridge.observe.report_table import number
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner

@@ -13,10 +13,10 @@ import numpy as np
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.series import FloatColumn
-from mavbridge.commands.output import number
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.files import write_output
 from mavbridge.flight.outcome import describe
+from mavbridge.observe.report_table import number
 from mavbridge.observe.viewer.layout import action_title
 
 MAX_VIDEO_BYTES = 40_000_000

@@ -16,7 +16,7 @@ from rich.text import Text
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse, recorded_solves
 from mavbridge.commands.inspect.page import write_page
-from mavbridge.commands.output import number, print_status, table_console, write_json
+from mavbridge.commands.output import print_status, table_console, write_json
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
@@ -24,7 +24,7 @@ from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
-from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
+from mavbridge.observe.report_table import number, rate_style, timing_table, verdicts
 from mavbridge.observe.timing import report_document
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
@@ -112,7 +112,7 @@ def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
         ("rows", rows_hz, flight.meta.action_hz, share),
         ("vision", vision.rate_hz, vision.target_hz, ""),
     ):
-        text = f"{shown_rate(rate_hz)} Hz of {target_hz:.4g} Hz{rest}"
+        text = f"{number(rate_hz, 1)} Hz of {target_hz:.4g} Hz{rest}"
         yield Text.assemble((f"{name:9}", "bold"), (text, rate_style(rate_hz, target_hz)))
     if flight.report.observer_drops.recorder:
         text = f"missed {flight.report.observer_drops.recorder} events"

@@ -18,7 +18,7 @@ from mavbridge.guard.channel import SocketPort
 from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.observe.report_table import rate_style, shown_rate
+from mavbridge.observe.report_table import number, rate_style
 from mavbridge.observe.terminal import FlightScreen, RateMeter
 from policy.contract import Contract
 
@@ -143,7 +143,7 @@ class RecordScreen(FlightScreen):
             hz = meter.sample_hz()
             line.append(f"  {name} ")
             style = "" if wanted_hz is None else rate_style(hz, wanted_hz)
-            line.append(f"{shown_rate(hz)} Hz", style=style)
+            line.append(f"{number(hz, 1)} Hz", style=style)
         style = "yellow" if shown.disk_gb < LOW_GB else ""
         line.append(f"  disk {shown.disk_gb:.1f} GB", style=style)
         counts = shown.counts

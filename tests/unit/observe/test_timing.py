@@ -15,10 +15,11 @@ from helpers.factories import (
 )
 from helpers.reports import report_of
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.files import as_json
 from mavbridge.core.reasons import Code, Reason, because, reason_to_json
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
-from mavbridge.observe.timing import MAX_RELEASES, report_json
+from mavbridge.observe.timing import MAX_RELEASES, report_document
 
 LINK = LinkStats(
     messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("RC_CHANNELS", 20.0)),
@@ -151,7 +152,7 @@ def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
 
 def test_the_json_holds_the_report_with_links_and_reasons_of_releases() -> None:
     report = report_of(make_released_tick(0), make_tick(1), link=LINK)
-    document = json.loads(report_json(report))
+    document = json.loads(as_json(report_document(report)))
     assert list(document) == [each.name for each in fields(report)]
     assert document["sticks"] == asdict(report.sticks)
     assert document["feature_age_ms"] == dict.fromkeys(("p50", "p99", "p999", "max"), 40.0)
