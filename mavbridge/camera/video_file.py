@@ -54,13 +54,12 @@ class VideoFileCamera:
         if not wait_until_due(self._clock, self._start_ns + self.upcoming.captured_ns, timeout_ns):
             return None
         newest, played_ns = self.upcoming, self._clock.now_ns() - self._start_ns
-        self._frame_count += 1
-        self.upcoming = self._decode(previous_ns=newest.captured_ns)
+        frames_before = self._frame_count
         while self.upcoming is not None and self.upcoming.captured_ns <= played_ns:
             newest = self.upcoming
-            self.dropped_frames += 1
             self._frame_count += 1
             self.upcoming = self._decode(previous_ns=newest.captured_ns)
+        self.dropped_frames += self._frame_count - frames_before - 1
         captured_ns = self._start_ns + newest.captured_ns
         return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=newest.rgb)
 

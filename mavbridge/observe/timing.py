@@ -236,10 +236,9 @@ class _Sticks:
         self._last_ns = tick.woke_ns
 
     def report(self) -> SticksReport:
-        intervals = self._intervals
         return SticksReport(
             target_hz=self._target_hz,
-            rate_hz=_rate_hz(intervals, self._flying_ns),
+            rate_hz=_rate_hz(self._intervals, self._flying_ns),
             flying_s=round(self._flying_ns / NS_PER_S, 3),
             sends=self._sends,
             coasting_sends=self._coasting,
