@@ -34,7 +34,7 @@ from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeResult
-from mavbridge.simulation.world import draw_conditions, make_vehicle
+from mavbridge.simulation.world import DRAWN_CONDITIONS, make_vehicle
 from policy.files import read_json
 
 Z95 = 1.959963984540054
@@ -95,7 +95,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         delays=delays,
         draw_images=not is_scripted(config.policy),
     )
-    conditions = draw_conditions(config.conditions, spec.course_seed)
+    conditions = DRAWN_CONDITIONS[config.conditions](spec.course_seed)
     if config.gusts is not None:
         conditions = replace(conditions, seed=spec.course_seed, gust_rms_mps=config.gusts)
     flight = SimulatedFlight(

@@ -36,25 +36,13 @@ MOUNTS: dict[str, Quat] = {
 tilt of the front one; in the image of ``down``, the upper edge is ahead."""
 NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
 """Nominal vehicle, ready at once: the handshake alone takes longer than half a second."""
-
-
-def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
-    """Return the conditions of an evaluated flight.
-
-    ``seed`` is the seed of its course, so that no demonstration had the same conditions.
-
-    Raises:
-        UsageError: the seed is negative.
-    """
-    match kind:
-        case "nominal":
-            return NOMINAL
-        case "random":
-            return random_conditions(seed)
-        case "held-out":
-            return held_out_conditions(seed)
-        case "unseen":
-            return unseen_conditions(seed)
+DRAWN_CONDITIONS: dict[ConditionsKind, Callable[[int], Conditions]] = {
+    "nominal": lambda seed: NOMINAL,
+    "random": random_conditions,
+    "held-out": held_out_conditions,
+    "unseen": unseen_conditions,
+}
+"""Conditions of an evaluated flight by the seed of its course; no demonstration has the same."""
 
 
 def make_vehicle(
