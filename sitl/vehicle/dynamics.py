@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.rotation import Quat, Vec3, cos_tilt
@@ -46,7 +45,6 @@ class Airframe:
 QUAD = Airframe()
 
 _BODY = 1  # after the world
-_FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
@@ -104,16 +102,7 @@ class BodyState(NamedTuple):
     velocity_ned_mps: Vec3
     rate_body_radps: Vec3
     specific_force_body_mps2: Vec3  # accelerometer reading: (0, 0, -9.8) at rest
-    motors: tuple[float, ...]  # thrust over full thrust, in ArduCopter's quad X order
     touching: bool  # a part of the frame is on the ground
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PhysicsState:
-    """Full state of MuJoCo, and the same instant in NED and FRD."""
-
-    integration: NDArray[np.float64]
-    body: BodyState
 
 
 def _flip(v: Sequence[float]) -> Vec3:
@@ -122,7 +111,7 @@ def _flip(v: Sequence[float]) -> Vec3:
 
 
 class Quadrotor:
-    """Stateless physical model; MuJoCo's data is only scratch space."""
+    """Physical model of one vehicle; it starts on the ground at the origin, heading north."""
 
     def __init__(self, conditions: Conditions = NOMINAL, airframe: Airframe = QUAD) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml(airframe, conditions))
@@ -132,18 +121,13 @@ class Quadrotor:
         self._rotor_drag_nspm = rotor_drag_nspm * conditions.drag_factor
         self._model.dof_damping[:3] = self._rotor_drag_nspm
         self._data = mujoco.MjData(self._model)
-        self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
-
-    def at_rest(self) -> PhysicsState:
-        """Return the state on the ground at the origin, heading north, motors stopped."""
-        mujoco.mj_resetData(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
-        return self._capture()
+        self.body = self._capture()
 
-    def airborne(
+    def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
-    ) -> PhysicsState:
-        """Return a state in the air, not rotating, with motors at hover thrust."""
+    ) -> None:
+        """Put the vehicle into the air, not rotating, with motors at hover thrust."""
         mujoco.mj_resetData(self._model, self._data)
         w, *vector = ned_from_body_wxyz
         self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
@@ -152,45 +136,37 @@ class Quadrotor:
         hover = self._mass_kg * GRAVITY_MPS2 / (4.0 * self._max_motor_thrust_n * tilt)
         self._data.act[:] = min(1.0, hover)
         mujoco.mj_forward(self._model, self._data)
-        return self._capture()
+        self.body = self._capture()
 
     def step(
         self,
-        state: PhysicsState,
         motor_commands: Sequence[float],
         substeps: int,
         wind_ned_mps: Vec3 = (0.0, 0.0, 0.0),
-    ) -> PhysicsState:
-        """Return the state after ``substeps`` physics steps with constant commands (0..1) and wind.
+    ) -> None:
+        """Run ``substeps`` physics steps with constant commands (0..1) and wind.
 
         MuJoCo's body drag includes the wind. Its damping, used as rotor drag, is relative to the
         ground, so the effect of moving air is added as a force.
         """
-        mujoco.mj_setState(self._model, self._data, state.integration, _FULL_STATE)
         self._data.ctrl[:] = motor_commands
         wind = _flip(wind_ned_mps)
         self._model.opt.wind[:] = wind
         self._data.xfrc_applied[_BODY, :3] = [self._rotor_drag_nspm * speed for speed in wind]
         mujoco.mj_step(self._model, self._data, nstep=substeps)
-        return self._capture()
+        self.body = self._capture()
 
-    def _capture(self) -> PhysicsState:
+    def _capture(self) -> BodyState:
         data = self._data
-        integration = np.empty(self._state_size)
-        mujoco.mj_getState(self._model, data, integration, _FULL_STATE)
         qpos = data.qpos.tolist()
         qvel = data.qvel.tolist()
-        return PhysicsState(
-            integration=integration,
-            body=BodyState(
-                position_ned_m=_flip(qpos[0:3]),
-                ned_from_body_wxyz=(qpos[3], *_flip(qpos[4:7])),
-                velocity_ned_mps=_flip(qvel[0:3]),
-                rate_body_radps=_flip(qvel[3:6]),
-                specific_force_body_mps2=_flip(data.sensordata.tolist()),
-                motors=tuple(data.act.tolist()),
-                touching=data.ncon > 0,
-            ),
+        return BodyState(
+            position_ned_m=_flip(qpos[0:3]),
+            ned_from_body_wxyz=(qpos[3], *_flip(qpos[4:7])),
+            velocity_ned_mps=_flip(qvel[0:3]),
+            rate_body_radps=_flip(qvel[3:6]),
+            specific_force_body_mps2=_flip(data.sensordata.tolist()),
+            touching=data.ncon > 0,
         )
 
 

@@ -163,20 +163,16 @@ class Autopilot(ABC):
         self.now_ns = boot_ns  # time of the last control step
         self.armed = False
         self.landed = True
-        self.sensors_frozen = False
-        """Injected fault: telemetry and control keep the last state while the physics goes on."""
         self.position_lost = False
         """Injected fault: the estimator has no horizontal position while this is set."""
         self.texts: list[StatusText] = []
         """Status texts to send on every link; the reader empties the list."""
-        self.motor_commands: tuple[float, ...] = STOPPED
         conditions = config.conditions
         rate_noise_radps = math.hypot(conditions.rate_noise_radps, self.gyro_noise_radps)
         self._quad = Quadrotor(conditions, self.airframe)
         self._wind = Wind(conditions, self.step_s)
         self._noise = SensorNoise(replace(conditions, rate_noise_radps=rate_noise_radps))
-        self._physics = self._quad.at_rest()
-        self.sensed = self._physics.body
+        self.sensed = self.truth
         self._still_since_ns: int | None = boot_ns
 
     @property
@@ -207,8 +203,8 @@ class Autopilot(ABC):
 
     @property
     def truth(self) -> BodyState:
-        """True state of the vehicle, without sensor faults and noise."""
-        return self._physics.body
+        """True state of the vehicle, without sensor noise."""
+        return self._quad.body
 
     @property
     def yaw_rad(self) -> float:
@@ -236,12 +232,9 @@ class Autopilot(ABC):
     def step(self) -> None:
         self.now_ns += self.step_ns
         self._read_inputs()
-        self.motor_commands = self._motors()
         substeps = self.step_ns // self.airframe.step_ns
-        wind_mps = self._wind.step()
-        self._physics = self._quad.step(self._physics, self.motor_commands, substeps, wind_mps)
-        if not self.sensors_frozen:
-            self.sensed = self._noise.sense(self._physics.body)
+        self._quad.step(self._motors(), substeps, self._wind.step())
+        self.sensed = self._noise.sense(self.truth)
         self._detect_landing()
 
     def launch(
@@ -251,8 +244,8 @@ class Autopilot(ABC):
 
         A mode flown by setpoints is kept.
         """
-        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
-        self.sensed = self._physics.body
+        self._quad.launch(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
+        self.sensed = self.truth
         self._start_in_air()
 
     @abstractmethod

@@ -20,7 +20,6 @@ BODY = BodyState(
     velocity_ned_mps=(0.0, 0.0, 0.0),
     rate_body_radps=(1.0, 2.0, 3.0),
     specific_force_body_mps2=(0.0, 0.0, -9.8),
-    motors=(0.4,) * 4,
     touching=False,
 )
 

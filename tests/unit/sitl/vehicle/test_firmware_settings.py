@@ -86,7 +86,8 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
     course = make_course(3)
     gate = course.gates[2]
     position = tuple(part - 3.0 for part in gate.center_ned_m[:2])
-    body = Quadrotor().airborne((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY).body
+    quad = Quadrotor()
+    quad.launch((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY)
     nominal = replace(NOMINAL, rc_dead_zones_us=(0.0,) * 4, throttle_dead_zone_permille=0.0)
     other = replace(
         nominal,
@@ -96,7 +97,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
         pilot_speed_down_cmps=500,
     )
     first, second = (
-        Expert(course, 5.0, next_gate=2, params=ArduPilotParams(conditions)).sticks(body, 0.0)
+        Expert(course, 5.0, next_gate=2, params=ArduPilotParams(conditions)).sticks(quad.body, 0.0)
         for conditions in (nominal, other)
     )
     assert min(map(abs, first)) > 0.02
