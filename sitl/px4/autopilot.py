@@ -37,7 +37,6 @@ class Px4(Commander):
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
         self.receiver_us = config.receiver_us
-        """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
         self.flight = Px4Control(params)
         self._has_transmitter = config.receiver_us is not None
         self._receiver_due_ns = boot_ns
