@@ -60,24 +60,6 @@ _NAMES_4_6 = {
     "MAV_OPTIONS": "SYSID_ENFORCE",  # corresponds to bit 0
     "MAV_SYSID": "SYSID_THISMAV",
 }
-_ABSENT_IN_4_6 = ("MAV_GCS_SYSID_HI",)
-_NAMES_4_7 = {
-    "ANGLE_MAX": "ATC_ANGLE_MAX",
-    "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX",
-    "ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX",
-    "ATC_ACCEL_Y_MAX": "ATC_ACC_Y_MAX",
-    "LAND_SPEED": "LAND_SPD_MS",
-    "PILOT_ACCEL_Z": "PILOT_ACC_Z",
-    "PILOT_SPEED_DN": "PILOT_SPD_DN",
-    "PILOT_SPEED_UP": "PILOT_SPD_UP",
-    "RTL_ALT": "RTL_ALT_M",
-    "WPNAV_ACCEL_Z": "WP_ACC_Z",
-    "WPNAV_SPEED_DN": "WP_SPD_DN",
-    "WPNAV_SPEED_UP": "WP_SPD_UP",
-}
-"""Renamed parameters, all in metres or degrees; under the old names they were in hundredths."""
-_SI_NAMES = frozenset(_NAMES_4_7.values())
-HUNDREDTHS = 100.0
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
@@ -115,22 +97,21 @@ class ArduPilotParams(Params):
             dead_zone_us = dead_zones_us[index] if index < len(dead_zones_us) else 0.0
             channel = {**_RC_CHANNEL, "DZ": dead_zone_us}
             values |= {f"RC{index + 1}_{name}": value for name, value in channel.items()}
+        renamed = _NAMES_4_6 if release == "4.6" else {}
+        if release == "4.6":
+            del values["MAV_GCS_SYSID_HI"]
         super().__init__(values)
-        renamed = {"4.6": _NAMES_4_6, "4.7-dev": {}, "4.7": _NAMES_4_7}[release]
-        absent = _ABSENT_IN_4_6 if release == "4.6" else ()
-        named = {renamed.get(name, name): name for name in self._values if name not in absent}
+        named = {renamed.get(name, name): name for name in self._values}
         self._by_wire_name = {name: named[name] for name in sorted(named)}
         self.names = tuple(self._by_wire_name)
 
     def on_wire(self, name: str) -> float:
-        """Return the value in the wire unit of this name, one of ``names``."""
-        value = self._values[self._by_wire_name[name]]
-        return value / HUNDREDTHS if name in _SI_NAMES else value
+        """Return the value of this name, one of ``names``."""
+        return self._values[self._by_wire_name[name]]
 
     def set_on_wire(self, name: str, packed: float) -> bool:
-        """Store a value by its wire name, in its wire unit. Return False if refused, like `set`."""
-        scale = HUNDREDTHS if name in _SI_NAMES else 1.0
-        return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * packed)
+        """Store a value by its wire name. Return False if refused, like `set`."""
+        return name in self._by_wire_name and self.set(self._by_wire_name[name], packed)
 
     def decimal(self, name: str) -> float:
         """Return the value rounded to the seven digits of a float32: 0.15, not 0.1500000059."""

@@ -74,7 +74,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
 
     def _is_from_gcs(self, message: Message) -> bool:
         low = self._ap.params.integer("MAV_GCS_SYSID")
-        high = max(low, self._ap.params.integer("MAV_GCS_SYSID_HI"))
+        high = max(low, int(self._ap.params.get("MAV_GCS_SYSID_HI", 0.0)))
         return low <= int(message.get_srcSystem()) <= high
 
     def on_heartbeat(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:

@@ -14,8 +14,8 @@ MID_RECEIVER_US = (1500,) * 8
 
 AutopilotName: TypeAlias = Literal["ardupilot", "px4"]
 
-ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev", "4.7"]
-"""ArduPilot release for names and units of parameters; 4.5 has those of 4.6. The measured firmware,
+ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev"]
+"""ArduPilot release for the names of parameters; 4.5 has those of 4.6. The measured firmware,
 4.7-dev, has the new names of the system ids and the old names of the rest."""
 
 Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]

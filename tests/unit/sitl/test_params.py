@@ -38,8 +38,7 @@ def test_unknown_names_and_values_beyond_float32_are_refused(make, seconds):
     ("release", "present", "absent"),
     [
         ("4.6", ("SYSID_THISMAV", "SYSID_MYGCS", "SYSID_ENFORCE", "ANGLE_MAX"), "MAV_GCS_SYSID_HI"),
-        ("4.7-dev", ("MAV_SYSID", "MAV_GCS_SYSID", "MAV_OPTIONS", "PILOT_SPEED_UP"), "WP_SPD_UP"),
-        ("4.7", ("MAV_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "RTL_ALT_M"), "ANGLE_MAX"),
+        ("4.7-dev", ("MAV_SYSID", "MAV_GCS_SYSID", "MAV_OPTIONS", "ANGLE_MAX"), "SYSID_MYGCS"),
     ],
 )
 def test_a_release_answers_to_its_own_names_alone(release, present, absent):
@@ -47,12 +46,3 @@ def test_a_release_answers_to_its_own_names_alone(release, present, absent):
     assert set(present) <= set(names)
     assert absent not in names
     assert len(set(names)) == len(names) == len(ArduPilotParams().names) - (release == "4.6")
-
-
-def test_release_4_7_speaks_of_metres_and_degrees():
-    params = ArduPilotParams(release="4.7")
-    assert params.on_wire("ATC_ANGLE_MAX") == pytest.approx(30.0)
-    assert params.on_wire("PILOT_SPD_UP") == pytest.approx(2.5)
-    assert params.set_on_wire("RTL_ALT_M", 20.0)
-    assert params["RTL_ALT"] == pytest.approx(2000.0)
-    assert not params.set_on_wire("RTL_ALT", 1500.0)
