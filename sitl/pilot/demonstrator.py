@@ -4,7 +4,6 @@ import cmath
 import math
 from typing import NamedTuple
 
-from sitl.ardupilot.params import ArduPilotParams
 from sitl.course import Course
 from sitl.pilot.course_guide import Agility, CourseGuide, Demand, Predicted
 from sitl.vehicle.conditions import NOMINAL
@@ -85,37 +84,27 @@ class StickPositions(NamedTuple):
 CENTRED = StickPositions(0.0, 0.0, 0.0, 0.0)
 
 
-class StickResponse:
-    """Inverse of the vehicle's ALT_HOLD stick curves."""
+LEAN_RAD = math.radians(NOMINAL.angle_max_cdeg / 100.0)
+YAW_RADPS = math.radians(NOMINAL.pilot_yaw_rate_degps)
+CLIMB_MPS = NOMINAL.pilot_speed_up_cmps / 100.0
+ROLL_DEAD, PITCH_DEAD, _, YAW_DEAD = (dead_us / 500.0 for dead_us in NOMINAL.rc_dead_zones_us)
+THROTTLE_DEAD = NOMINAL.throttle_dead_zone_permille / 5e5 * (1000.0 - NOMINAL.rc_dead_zones_us[2])
+"""Shares of the travel to each side; THR_DZ counts from the upper end of its channel's dead zone."""
 
-    def __init__(self, params: ArduPilotParams) -> None:
-        self._lean_rad = math.radians(params["ANGLE_MAX"] / 100.0)
-        self._yaw_radps = math.radians(params["PILOT_Y_RATE"])
-        self._yaw_expo = params["PILOT_Y_EXPO"]
-        self._climb_mps = params["PILOT_SPEED_UP"] / 100.0
-        self._descent_mps = params["PILOT_SPEED_DN"] / 100.0 or self._climb_mps
-        self._roll_dead = params["RC1_DZ"] / 500.0
-        self._pitch_dead = params["RC2_DZ"] / 500.0
-        self._yaw_dead = params["RC4_DZ"] / 500.0
-        half = (1000.0 - params["RC3_DZ"]) / 2.0
-        self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
 
-    def sticks(self, demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
-        """Convert a demand to sticks: leans that give its acceleration against this drag, and rates
-        as shares of full scale."""
-        accel_mps2 = demand.accel_mps2 - drag_mps2
-        forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
-        nose_down_rad = math.atan(forward_right.real)
-        right_rad = math.atan(forward_right.imag * math.cos(nose_down_rad))
-        full_mps = self._climb_mps if demand.climb_mps > 0.0 else self._descent_mps
-        turn = demand.yaw_rate_radps / self._yaw_radps
-        turn_input = turn / (1.0 - self._yaw_expo * (1.0 - abs(turn)))  # inverse of `input_expo`
-        return StickPositions(
-            throttle=_past_dead_zone(demand.climb_mps / full_mps, self._throttle_dead),
-            yaw=_past_dead_zone(turn_input, self._yaw_dead),
-            pitch=_past_dead_zone(nose_down_rad / self._lean_rad, self._pitch_dead),
-            roll=_past_dead_zone(right_rad / self._lean_rad, self._roll_dead),
-        )
+def sticks_for(demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
+    """Convert a demand to the nominal vehicle's ALT_HOLD sticks: leans that give its acceleration
+    against this drag, and rates as shares of full scale."""
+    accel_mps2 = demand.accel_mps2 - drag_mps2
+    forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
+    nose_down_rad = math.atan(forward_right.real)
+    right_rad = math.atan(forward_right.imag * math.cos(nose_down_rad))
+    return StickPositions(
+        throttle=_past_dead_zone(demand.climb_mps / CLIMB_MPS, THROTTLE_DEAD),
+        yaw=_past_dead_zone(demand.yaw_rate_radps / YAW_RADPS, YAW_DEAD),
+        pitch=_past_dead_zone(nose_down_rad / LEAN_RAD, PITCH_DEAD),
+        roll=_past_dead_zone(right_rad / LEAN_RAD, ROLL_DEAD),
+    )
 
 
 def _past_dead_zone(value: float, dead: float) -> float:
@@ -155,24 +144,14 @@ class Expert:
     """Demonstrator of one flight by sticks; call `sticks` at 50 Hz or more.
 
     ``speed_mps`` is its speed where the course allows it; at 8 m/s it slows down for corners.
-    ``params`` are the vehicle's, which determine stick curves and response times.
+    It does not know the vehicle's parameters: it has the nominal vehicle's stick curves and lag.
 
     Raises:
         UsageError: a speed that it cannot fly at.
     """
 
-    def __init__(
-        self,
-        course: Course,
-        speed_mps: float,
-        *,
-        next_gate: int = 0,
-        params: ArduPilotParams | None = None,
-    ) -> None:
+    def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
         self._guide = CourseGuide(course, STICK_AGILITY, speed_mps, next_gate)
-        params = ArduPilotParams() if params is None else params
-        self._lag_s = STICK_LAG_S + (params.decimal("ATC_INPUT_TC") - NOMINAL.input_time_s)
-        self._response = StickResponse(params)
 
     @property
     def next_gate(self) -> int | None:
@@ -182,9 +161,9 @@ class Expert:
         """Return the sticks for this state. Positions of successive calls are the flown
         trajectory."""
         north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
-        state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), self._lag_s)
+        state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), STICK_LAG_S)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
-        return self._response.sticks(demand, complex(north_mps2, east_mps2), state.yaw_rad)
+        return sticks_for(demand, complex(north_mps2, east_mps2), state.yaw_rad)
 
 
 class RateExpert:

@@ -79,7 +79,7 @@ def fly_course(
     else:
         vehicle.launch(start)
     next_gate = start.next_gate if start else 0
-    expert = Expert(course, speed_mps, next_gate=next_gate, params=vehicle.params)
+    expert = Expert(course, speed_mps, next_gate=next_gate)
     ticks: list[Tick] = []
     over_ns = None
     begin_ns = now_ns = vehicle.ap.now_ns

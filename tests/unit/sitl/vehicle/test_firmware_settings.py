@@ -8,14 +8,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import pwm_us
-from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course import AirborneStart, make_course
-from sitl.pilot.demonstrator import Expert, StickPositions
+from sitl.course import AirborneStart
+from sitl.pilot.demonstrator import StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import STEP_NS, VehicleConfig
-from sitl.vehicle.dynamics import Quadrotor
 from sitl.vehicle.rotation import IDENTITY, to_euler
 
 ALOFT = AirborneStart(
@@ -79,28 +77,3 @@ def test_phases_differ_from_vehicle_to_vehicle_and_follow_from_the_seed():
     assert len(set(firsts)) > 4
     assert 0.0 < min(firsts) <= max(firsts) <= 40.0
     assert sent_ms(3, stream_phase_spread=1.0) == sent_ms(3, stream_phase_spread=1.0)
-
-
-def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_differently():
-    """A turn in flight: the same lean and turn are asked for with other sticks."""
-    course = make_course(3)
-    gate = course.gates[2]
-    position = tuple(part - 3.0 for part in gate.center_ned_m[:2])
-    quad = Quadrotor()
-    quad.launch((*position, -1.0), (2.0, -1.0, 0.0), IDENTITY)
-    nominal = replace(NOMINAL, rc_dead_zones_us=(0.0,) * 4, throttle_dead_zone_permille=0.0)
-    other = replace(
-        nominal,
-        angle_max_cdeg=4500,
-        pilot_yaw_rate_degps=405.0,
-        pilot_speed_up_cmps=500,
-        pilot_speed_down_cmps=500,
-    )
-    first, second = (
-        Expert(course, 5.0, next_gate=2, params=ArduPilotParams(conditions)).sticks(quad.body, 0.0)
-        for conditions in (nominal, other)
-    )
-    assert min(map(abs, first)) > 0.02
-    assert max(map(abs, first)) < 1.0
-    ratios = [b / a for a, b in zip(first, second, strict=True)]
-    assert ratios == pytest.approx([0.5, 0.5, 2 / 3, 2 / 3])
