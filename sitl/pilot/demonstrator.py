@@ -89,7 +89,7 @@ YAW_RADPS = math.radians(NOMINAL.pilot_yaw_rate_degps)
 CLIMB_MPS = NOMINAL.pilot_speed_up_cmps / 100.0
 ROLL_DEAD, PITCH_DEAD, _, YAW_DEAD = (dead_us / 500.0 for dead_us in NOMINAL.rc_dead_zones_us)
 THROTTLE_DEAD = NOMINAL.throttle_dead_zone_permille / 5e5 * (1000.0 - NOMINAL.rc_dead_zones_us[2])
-"""Shares of the travel to each side; THR_DZ counts from the upper end of its channel's dead zone."""
+"""Shares of the travel to each side; THR_DZ counts beyond the dead zone of its channel."""
 
 
 def sticks_for(demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
