@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from sitl import UsageError
-from sitl.vehicle.rotation import Quat, Vec3, conjugate, rotate, to_euler, to_heading, wrap_pi
+from sitl.vehicle.rotation import Quat, Vec3, conjugate, horizontal, rotate, to_euler, wrap_pi
 
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
@@ -74,8 +74,8 @@ class Gate:
 
     def to_axes(self, vector_ned: Vec3) -> Vec3:
         """Rotate a NED direction, velocity or offset into gate axes: forward, right, down."""
-        north, east, down = vector_ned
-        return (*to_heading(north, east, self.yaw_rad), down)
+        level = horizontal(vector_ned) * cmath.rect(1.0, -self.yaw_rad)
+        return level.real, level.imag, vector_ned[2]
 
     def offset_m(self, position_ned_m: Vec3) -> Vec3:
         """Return the position relative to the gate's centre in gate axes: forward, right, down."""

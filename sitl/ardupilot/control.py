@@ -1,5 +1,6 @@
 """Inner loops: lean, attitude or body rate to angular acceleration; acceleration to lean."""
 
+import cmath
 import math
 
 from sitl.ardupilot.params import DEFAULT_RATE_P, ArduPilotParams
@@ -15,7 +16,6 @@ from sitl.vehicle.rotation import (
     integrate,
     rotation_between,
     to_euler,
-    to_heading,
     yaw_of,
 )
 
@@ -187,8 +187,7 @@ def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
     return min(1.0, thrust * max(0.0, min(1.0, 10.0 * lean)) / max(lean, 0.1))
 
 
-def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:
-    """Return roll and pitch [rad] that give a hovering vehicle this acceleration north and east."""
-    north, east = accel_ne_mps2
-    forward, right = to_heading(north, east, yaw_of(body.ned_from_body_wxyz))
-    return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)
+def lean_for(accel_mps2: complex, body: BodyState) -> tuple[float, float]:
+    """Return roll and pitch [rad] that give a hovering vehicle this horizontal acceleration."""
+    level = accel_mps2 * cmath.rect(1.0, -yaw_of(body.ned_from_body_wxyz))
+    return math.atan2(level.imag, GRAVITY_MPS2), -math.atan2(level.real, GRAVITY_MPS2)

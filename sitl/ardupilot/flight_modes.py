@@ -1,6 +1,5 @@
 """Flight modes: ArduCopter's mode numbers and the control laws from sticks to motor commands."""
 
-import math
 from enum import IntEnum
 
 from sitl.ardupilot import rc as pilot
@@ -9,7 +8,7 @@ from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import Sticks
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten, thrust_for
-from sitl.vehicle.rotation import Quat, Vec3
+from sitl.vehicle.rotation import Quat, Vec3, horizontal, length
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
@@ -81,7 +80,7 @@ class CopterControl:
         self._attitude = AttitudeController(params)
         self._height = HeightController(STEP_S)
         self._home_reached = False
-        self._hold_ned_m: Vec3 | None = None
+        self._hold_m: complex | None = None  # north + 1j * east
         self.guided = GuidedControl(params, self._attitude, self._height)
         self.thrust = self.collective = 0.0
         """Commanded mean thrust, as a fraction of full, before and after the boost for a lean."""
@@ -99,7 +98,7 @@ class CopterControl:
         self._attitude.reset(body)
         self._height.reset(body)
         self._home_reached = False
-        self._hold_ned_m = None
+        self._hold_m = None
         self.thrust = self.collective = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
@@ -126,7 +125,7 @@ class CopterControl:
         """Run one step of a leaning mode. Return the body angular acceleration [rad/s^2]."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
-            self._hold_ned_m = None
+            self._hold_m = None
         elif mode.holds_position:
             roll, pitch = self._lean_to_hold(body)
         elif mode.lands:
@@ -156,31 +155,28 @@ class CopterControl:
 
     def _lean_home(self, mode: Mode, body: BodyState) -> tuple[float, float]:
         """Return the lean that stops the drift, or in RTL flies home from the return height on."""
-        north, east, down = body.position_ned_m
-        wanted_n = wanted_e = 0.0
+        wanted_mps = 0j
         if mode is Mode.RTL and not self._home_reached:
-            distance = math.hypot(north, east)
+            home_m = -horizontal(body.position_ned_m)
+            distance = length(home_m)
             if distance < RTL_ARRIVED_M:
                 self._home_reached = True
-            elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
+            elif -body.position_ned_m[2] > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
                 speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
-                wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
-        return _lean_towards(wanted_n, wanted_e, body)
+                wanted_mps = home_m / distance * speed
+        return _lean_towards(wanted_mps, body)
 
     def _lean_to_hold(self, body: BodyState) -> tuple[float, float]:
         """Return the lean that stops the vehicle and then holds its resting position."""
-        wanted_n = wanted_e = 0.0
-        if self._hold_ned_m is not None:
-            north, east, _ = self._hold_ned_m
-            wanted_n = POSITION_GAIN_PER_S * (north - body.position_ned_m[0])
-            wanted_e = POSITION_GAIN_PER_S * (east - body.position_ned_m[1])
-        elif math.hypot(*body.velocity_ned_mps[:2]) < HOLD_BELOW_MPS:
-            self._hold_ned_m = body.position_ned_m
-        return _lean_towards(wanted_n, wanted_e, body)
+        wanted_mps = 0j
+        if self._hold_m is not None:
+            wanted_mps = POSITION_GAIN_PER_S * (self._hold_m - horizontal(body.position_ned_m))
+        elif length(horizontal(body.velocity_ned_mps)) < HOLD_BELOW_MPS:
+            self._hold_m = horizontal(body.position_ned_m)
+        return _lean_towards(wanted_mps, body)
 
 
-def _lean_towards(wanted_n_mps: float, wanted_e_mps: float, body: BodyState) -> tuple[float, float]:
+def _lean_towards(wanted_mps: complex, body: BodyState) -> tuple[float, float]:
     """Return roll and pitch [rad] that bring the velocity to the wanted one, within the limit."""
-    accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
-    accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
-    return lean_for(shorten((accel_n_mps2, accel_e_mps2), HOLD_ACCEL_MPS2), body)
+    accel_mps2 = VELOCITY_GAIN_PER_S * (wanted_mps - horizontal(body.velocity_ned_mps))
+    return lean_for(shorten(accel_mps2, HOLD_ACCEL_MPS2), body)

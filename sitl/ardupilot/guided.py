@@ -10,9 +10,9 @@ from enum import Enum, auto
 from sitl.ardupilot.control import STEP_S, AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.vehicle.dynamics import BodyState, HeightController, clamp, shorten, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, clamp_axes, shorten, thrust_for
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
-from sitl.vehicle.rotation import Vec3, from_euler, integrate, to_euler
+from sitl.vehicle.rotation import Vec3, from_euler, horizontal, integrate, length, to_euler
 
 OPTION_THRUST = 8
 """Bit of GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective instead of a climb rate."""
@@ -160,7 +160,7 @@ class GuidedControl:
             self.velocity = STOP
         roll = pitch = 0.0
         if has_position:
-            accel = self._track.step((north, east), body)
+            accel = self._track.step(complex(north, east), body)
             roll, pitch = lean_for(accel, body)
         self._yaw_rate_radps = self._attitude.slew("Y", yaw_rate, self._yaw_rate_radps)
         self._yaw += self._yaw_rate_radps * STEP_S
@@ -201,31 +201,26 @@ class _Track:
     """Horizontal target whose velocity changes without jumps, and the controller towards it."""
 
     def __init__(self) -> None:
-        self._position_m = [0.0, 0.0]
-        self._velocity_mps = [0.0, 0.0]
-        self._accel_mps2 = [0.0, 0.0]
+        self._position_m = self._velocity_mps = self._accel_mps2 = 0j
 
     def reset(self, body: BodyState) -> None:
-        self._position_m = list(body.position_ned_m[:2])
-        self._velocity_mps = list(body.velocity_ned_mps[:2])
-        self._accel_mps2 = [0.0, 0.0]
+        self._position_m = horizontal(body.position_ned_m)
+        self._velocity_mps = horizontal(body.velocity_ned_mps)
+        self._accel_mps2 = 0j
 
-    def step(self, wanted_mps: tuple[float, float], body: BodyState) -> tuple[float, float]:
-        """Return the vehicle's acceleration north and east [m/s^2]."""
-        error = [w - v for w, v in zip(wanted_mps, self._velocity_mps, strict=True)]
-        scale = min(SPEED_GAIN_PER_S, ACCEL_MPS2 / max(1e-6, math.hypot(*error)))
-        accel = [0.0, 0.0]
-        for k in range(2):
-            change = clamp(scale * error[k] - self._accel_mps2[k], JERK_MPS3 * STEP_S)
-            self._accel_mps2[k] += change
-            self._velocity_mps[k] += self._accel_mps2[k] * STEP_S
-            here_m = body.position_ned_m[k]
-            ahead_m = self._position_m[k] + self._velocity_mps[k] * STEP_S - here_m
-            self._position_m[k] = here_m + clamp(ahead_m, MAX_POSITION_ERROR_M)
-            speed_error = (
-                self._velocity_mps[k]
-                + POSITION_GAIN_PER_S * (self._position_m[k] - here_m)
-                - body.velocity_ned_mps[k]
-            )
-            accel[k] = self._accel_mps2[k] + VELOCITY_GAIN_PER_S * speed_error
-        return shorten((accel[0], accel[1]), MAX_LEAN_ACCEL_MPS2)
+    def step(self, wanted_mps: complex, body: BodyState) -> complex:
+        """Return the vehicle's acceleration [m/s^2]."""
+        error = wanted_mps - self._velocity_mps
+        scale = min(SPEED_GAIN_PER_S, ACCEL_MPS2 / max(1e-6, length(error)))
+        self._accel_mps2 += clamp_axes(scale * error - self._accel_mps2, JERK_MPS3 * STEP_S)
+        self._velocity_mps += self._accel_mps2 * STEP_S
+        here_m = horizontal(body.position_ned_m)
+        ahead_m = self._position_m + self._velocity_mps * STEP_S - here_m
+        self._position_m = here_m + clamp_axes(ahead_m, MAX_POSITION_ERROR_M)
+        speed_error = (
+            self._velocity_mps
+            + POSITION_GAIN_PER_S * (self._position_m - here_m)
+            - horizontal(body.velocity_ned_mps)
+        )
+        accel = self._accel_mps2 + VELOCITY_GAIN_PER_S * speed_error
+        return shorten(accel, MAX_LEAN_ACCEL_MPS2)

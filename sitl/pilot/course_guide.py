@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sitl import UsageError
 from sitl.course import Course, Gate, GateCounter, crossing
 from sitl.vehicle.dynamics import clamp
-from sitl.vehicle.rotation import Vec3, wrap_pi
+from sitl.vehicle.rotation import Vec3, horizontal, length, wrap_pi
 
 FloatArray = NDArray[np.float64]
 
@@ -148,8 +148,7 @@ class Predicted:
 
     @property
     def velocity_mps(self) -> complex:
-        north, east, _ = self.velocity_ned_mps
-        return complex(north, east)
+        return horizontal(self.velocity_ned_mps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,8 +211,8 @@ def _approach(
 ) -> Demand:
     """Return the demand along the path through the gates ahead, at the speed that it allows."""
     velocity = state.velocity_mps
-    to_aim_m = _aim_point(state, ahead) - complex(*state.position_ned_m[:2])
-    distance_m = max(_length(to_aim_m), 1e-3)
+    to_aim_m = _aim_point(state, ahead) - horizontal(state.position_ned_m)
+    distance_m = max(length(to_aim_m), 1e-3)
     sight = to_aim_m / distance_m
     closing_mps = max(MIN_SPEED_MPS, (velocity * sight.conjugate()).real)
     waypoints = _waypoints(state, ahead, closing_mps, agility, speed_mps)
@@ -221,7 +220,7 @@ def _approach(
     accel_n, accel_e, accel_d = accel_mps2[0].tolist()
     # Speed along the path is controlled; the plan's speed only serves its timing.
     along = velocity + MIN_SPEED_MPS * sight
-    along /= max(_length(along), 1e-3)
+    along /= max(length(along), 1e-3)
     right_mps2 = clamp((complex(accel_n, accel_e) * along.conjugate()).imag, agility.max_accel_mps2)
     allowed_mps = min(
         speed_mps,
@@ -244,9 +243,9 @@ def _aim_point(state: Predicted, ahead: tuple[Gate, ...]) -> complex:
     """Return the next gate; nearer than ``LOOK_M``, a point that slides along the leg after it."""
     gate = ahead[0]
     forward_m, _, _ = gate.offset_m(state.position_ned_m)
-    center, leg, leg_m = complex(*gate.center_ned_m[:2]), cmath.rect(1.0, gate.yaw_rad), 1.0
+    center, leg, leg_m = horizontal(gate.center_ned_m), cmath.rect(1.0, gate.yaw_rad), 1.0
     if len(ahead) > 1:
-        leg = complex(*ahead[1].center_ned_m[:2]) - center
+        leg = horizontal(ahead[1].center_ned_m) - center
         leg_m = math.dist(ahead[1].center_ned_m, gate.center_ned_m)
     return center + max(0.0, LOOK_M + forward_m) / leg_m * leg
 
@@ -320,7 +319,7 @@ def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
     wanted_mps = complex(-BACKING_SPEED_MPS, across_mps) * cmath.rect(1.0, gate.yaw_rad)
     accel = SPEED_GAIN_PER_S * (wanted_mps - state.velocity_mps)
     return Demand(
-        accel_mps2=min(1.0, -agility.along_accel_mps2[0] / max(1e-6, _length(accel))) * accel,
+        accel_mps2=min(1.0, -agility.along_accel_mps2[0] / max(1e-6, length(accel))) * accel,
         climb_mps=0.0 if is_beside else clamp(down_m, 1.0),
         yaw_rate_radps=_yaw_rate(gate.yaw_rad - state.yaw_rad, 0.0),
     )
@@ -328,7 +327,7 @@ def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
 
 def _brake(state: Predicted, agility: Agility) -> Demand:
     most_mps = -agility.along_accel_mps2[0] / BRAKING_GAIN_PER_S
-    gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
+    gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, length(state.velocity_mps)))
     return Demand(-gain * state.velocity_mps, 0.0, 0.0)
 
 
@@ -343,11 +342,6 @@ def _blend(a: Demand, b: Demand, share: float) -> Demand:
         climb_mps=a.climb_mps + share * (b.climb_mps - a.climb_mps),
         yaw_rate_radps=a.yaw_rate_radps + share * (b.yaw_rate_radps - a.yaw_rate_radps),
     )
-
-
-def _length(vector: complex) -> float:
-    """Return the length; unlike ``abs``, it is the same with every platform's C library."""
-    return math.hypot(vector.real, vector.imag)
 
 
 def _smoothstep(value: float, low: float, high: float) -> float:

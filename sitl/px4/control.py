@@ -5,22 +5,23 @@ chosen so that a step of rate or attitude takes as long as measured on PX4's SIH
 parameters only scale them.
 """
 
+import cmath
 import math
 from collections import deque
-from typing import TypeAlias
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import DEFAULT_RATE_P, Px4Params
-from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp, shorten
+from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp, clamp_axes, shorten
 from sitl.vehicle.rotation import (
     Quat,
     Vec3,
     conjugate,
     from_euler,
+    horizontal,
+    length,
     multiply,
     rotate,
     rotation_between,
-    to_heading,
 )
 
 STEP_NS = 4 * NS_PER_MS
@@ -35,8 +36,7 @@ SIH_QUAD = Airframe(
 )
 HOVER_THRUST = 0.484
 
-NorthEast: TypeAlias = tuple[float, float]
-STILL: NorthEast = (0.0, 0.0)
+STILL = 0j  # horizontal vectors are complex: north + 1j * east
 
 RATE_GAIN_PER_S = 14.0  # roll and pitch, at the default MC_ROLLRATE_P and MC_PITCHRATE_P
 YAW_GAIN_PER_S = 2.6
@@ -105,37 +105,30 @@ class VelocityController:
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
-        self._integral = [0.0, 0.0]
-        self._last_mps: NorthEast | None = None
-        self._accel = [0.0, 0.0]
+        self._integral = STILL
+        self._last_mps: complex | None = None
+        self._accel = STILL
 
-    def reset(self, accel_ne_mps2: NorthEast) -> None:
+    def reset(self, accel_mps2: complex) -> None:
         """Start with this acceleration in the integral, as if wind and drag required it."""
-        self._integral = list(accel_ne_mps2)
+        self._integral = accel_mps2
         self._last_mps = None
-        self._accel = [0.0, 0.0]
+        self._accel = STILL
 
-    def update(
-        self, body: BodyState, wanted_ne_mps: NorthEast, feedforward_ne_mps2: NorthEast = (0.0, 0.0)
-    ) -> NorthEast:
-        """Return the acceleration north and east [m/s^2], limited by MPC_TILTMAX_AIR."""
+    def update(self, body: BodyState, wanted_mps: complex, feedforward_mps2: complex) -> complex:
+        """Return the acceleration [m/s^2], limited by MPC_TILTMAX_AIR."""
         params = self._params
-        actual = body.velocity_ned_mps[:2]
-        last = actual if self._last_mps is None else self._last_mps
+        actual = horizontal(body.velocity_ned_mps)
+        last, self._last_mps = self._last_mps, actual
+        change = STILL if last is None else actual - last
+        error = wanted_mps - actual
+        self._accel += 0.1 * (change / STEP_S - self._accel)
+        integral = self._integral + params["MPC_XY_VEL_I_ACC"] * error * STEP_S
+        self._integral = clamp_axes(integral, MAX_VELOCITY_INTEGRAL_MPS2)
+        damping = params["MPC_XY_VEL_D_ACC"] * self._accel
+        wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral - damping
         limit = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_TILTMAX_AIR"]))
-        accel = []
-        for axis in range(2):
-            error = wanted_ne_mps[axis] - actual[axis]
-            self._accel[axis] += 0.1 * ((actual[axis] - last[axis]) / STEP_S - self._accel[axis])
-            self._integral[axis] = clamp(
-                self._integral[axis] + params["MPC_XY_VEL_I_ACC"] * error * STEP_S,
-                MAX_VELOCITY_INTEGRAL_MPS2,
-            )
-            damping = params["MPC_XY_VEL_D_ACC"] * self._accel[axis]
-            wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral[axis] - damping
-            accel.append(wanted + feedforward_ne_mps2[axis])
-        self._last_mps = (actual[0], actual[1])
-        return shorten((accel[0], accel[1]), limit)
+        return shorten(wanted + feedforward_mps2, limit)
 
 
 class Horizontal:
@@ -151,100 +144,79 @@ class Horizontal:
         self.accel_mps2 = STILL  # last demanded acceleration
         self.speed_mps = STILL  # last demanded velocity
         self._path_accel = STILL
-        self._place_m: NorthEast | None = None  # on the path, or held by POSCTL
+        self._place_m: complex | None = None  # on the path, or held by POSCTL
         self._stop_m = STILL
         self._reaction_s = 0.0
 
-    def reset(self, body: BodyState, accel_mps2: NorthEast) -> None:
+    def reset(self, body: BodyState, accel_mps2: complex) -> None:
         self._velocity.reset(accel_mps2)
         self.accel_mps2 = accel_mps2
-        self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
+        self.speed_mps = horizontal(body.velocity_ned_mps)
         self._path_accel = STILL
         self._place_m = None
-        self._reaction_s = REACTION_S if math.hypot(*self.speed_mps) > MOVING_MPS else 0.0
+        self._reaction_s = REACTION_S if length(self.speed_mps) > MOVING_MPS else 0.0
 
-    def track(self, velocity_mps: NorthEast, body: BodyState) -> NorthEast:
+    def track(self, velocity_mps: complex, body: BodyState) -> complex:
         """Track an OFFBOARD velocity, limited to MPC_XY_VEL_MAX."""
         self.speed_mps = shorten(velocity_mps, self._params["MPC_XY_VEL_MAX"])
         return self._follow(self.speed_mps, STILL, body)
 
-    def steer(self, wanted_mps: NorthEast, body: BodyState) -> NorthEast:
+    def steer(self, wanted_mps: complex, body: BodyState) -> complex:
         """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold."""
         params = self._params
         full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
         per_s = full / max(0.1, params["MPC_VEL_MANUAL"])
         if wanted_mps == STILL:
             per_s = BRAKING_PER_S
-        gaps = [per_s * (w - v) for w, v in zip(wanted_mps, self.speed_mps, strict=True)]
-        self._approach((gaps[0], gaps[1]), full, params["MPC_JERK_MAX"])
+        self._approach(per_s * (wanted_mps - self.speed_mps), full, params["MPC_JERK_MAX"])
         if wanted_mps != STILL:
             self._place_m = None
-        elif self._place_m is None and math.hypot(*self.speed_mps) < HOLD_BELOW_MPS:
-            self._place_m = _place(body)
+        elif self._place_m is None and length(self.speed_mps) < HOLD_BELOW_MPS:
+            self._place_m = horizontal(body.position_ned_m)
         if self._place_m is None:
             return self._follow(self.speed_mps, self._path_accel, body)
         self.speed_mps = self._path_accel = STILL
         return self._follow(self._towards(self._place_m, body), STILL, body)
 
-    def fly_to(self, target_m: NorthEast | None, body: BodyState) -> NorthEast:
-        """Fly to a position north and east of home, in AUTO modes; None: brake to a stop."""
+    def fly_to(self, target_m: complex | None, body: BodyState) -> complex:
+        """Fly to a position relative to home, in AUTO modes; None: brake to a stop."""
         params = self._params
         if self._reaction_s > 0.0:
             self._reaction_s -= STEP_S
-            self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
+            self.speed_mps = horizontal(body.velocity_ned_mps)
             return self.accel_mps2
         accel, jerk = max(0.1, params["MPC_ACC_HOR"]), max(0.1, params["MPC_JERK_AUTO"])
         if self._place_m is None:
-            self._place_m = _place(body)
-            lead_s = math.hypot(*self.speed_mps) / (2.0 * accel) + accel / (2.0 * jerk)
-            pairs = zip(self._place_m, self.speed_mps, strict=True)
-            north, east = (place + lead_s * speed for place, speed in pairs)
-            self._stop_m = (north, east)
+            self._place_m = horizontal(body.position_ned_m)
+            lead_s = length(self.speed_mps) / (2.0 * accel) + accel / (2.0 * jerk)
+            self._stop_m = self._place_m + lead_s * self.speed_mps
         target = self._stop_m if target_m is None else target_m
-        gain = params["MPC_XY_TRAJ_P"]
-        offsets = [gain * (t - p) for t, p in zip(target, self._place_m, strict=True)]
-        wanted = shorten((offsets[0], offsets[1]), params["MPC_XY_CRUISE"])
-        gaps = [w - v for w, v in zip(wanted, self.speed_mps, strict=True)]
-        gap = math.hypot(*gaps)
-        scale = math.sqrt(2.0 * jerk * gap) / gap if gap > 1e-6 else 0.0
-        self._approach((scale * gaps[0], scale * gaps[1]), accel, jerk)
-        north, east = self._place_m
-        self._place_m = (north + self.speed_mps[0] * STEP_S, east + self.speed_mps[1] * STEP_S)
-        correction = self._towards(self._place_m, body)
-        velocity = (self.speed_mps[0] + correction[0], self.speed_mps[1] + correction[1])
+        offset = params["MPC_XY_TRAJ_P"] * (target - self._place_m)
+        gap = shorten(offset, params["MPC_XY_CRUISE"]) - self.speed_mps
+        size = length(gap)
+        scale = math.sqrt(2.0 * jerk * size) / size if size > 1e-6 else 0.0
+        self._approach(scale * gap, accel, jerk)
+        self._place_m += self.speed_mps * STEP_S
+        velocity = self.speed_mps + self._towards(self._place_m, body)
         return self._follow(velocity, self._path_accel, body)
 
-    def _approach(self, wanted: NorthEast, limit: float, jerk: float) -> None:
+    def _approach(self, wanted: complex, limit: float, jerk: float) -> None:
         """Move the path's acceleration towards the wanted one, and integrate its velocity."""
-        wanted = shorten(wanted, limit)
-        step = jerk * STEP_S
-        now_n, now_e = self._path_accel
-        accel_n = now_n + clamp(wanted[0] - now_n, step)
-        accel_e = now_e + clamp(wanted[1] - now_e, step)
-        self._path_accel = (accel_n, accel_e)
-        self.speed_mps = (
-            self.speed_mps[0] + accel_n * STEP_S,
-            self.speed_mps[1] + accel_e * STEP_S,
-        )
+        change = shorten(wanted, limit) - self._path_accel
+        self._path_accel += clamp_axes(change, jerk * STEP_S)
+        self.speed_mps += self._path_accel * STEP_S
 
-    def _towards(self, place_m: NorthEast, body: BodyState) -> NorthEast:
-        gain = self._params["MPC_XY_P"]
-        north, east = body.position_ned_m[:2]
-        offset = (gain * (place_m[0] - north), gain * (place_m[1] - east))
+    def _towards(self, place_m: complex, body: BodyState) -> complex:
+        offset = self._params["MPC_XY_P"] * (place_m - horizontal(body.position_ned_m))
         return shorten(offset, self._params["MPC_XY_CRUISE"])
 
-    def _follow(self, velocity: NorthEast, feedforward: NorthEast, body: BodyState) -> NorthEast:
+    def _follow(self, velocity: complex, feedforward: complex, body: BodyState) -> complex:
         self.accel_mps2 = self._velocity.update(body, velocity, feedforward)
         return self.accel_mps2
 
 
-def _place(body: BodyState) -> NorthEast:
-    return body.position_ned_m[0], body.position_ned_m[1]
-
-
-def attitude_for(accel_ne_mps2: NorthEast, yaw_rad: float) -> Quat:
+def attitude_for(accel_mps2: complex, yaw_rad: float) -> Quat:
     """Return the attitude whose thrust gives this horizontal acceleration in level flight."""
-    north, east = accel_ne_mps2
-    forward, right = to_heading(north, east, yaw_rad)
-    roll = math.asin(right / math.sqrt(forward**2 + right**2 + GRAVITY_MPS2**2))
-    return from_euler(roll, math.atan2(-forward, GRAVITY_MPS2), yaw_rad)
+    level = accel_mps2 * cmath.rect(1.0, -yaw_rad)
+    roll = math.asin(level.imag / math.sqrt(level.real**2 + level.imag**2 + GRAVITY_MPS2**2))
+    return from_euler(roll, math.atan2(-level.real, GRAVITY_MPS2), yaw_rad)

@@ -1,5 +1,6 @@
 """Control laws of all modes: from mode, sticks, setpoint and state to motor commands."""
 
+import cmath
 import math
 from typing import TypeAlias
 
@@ -10,7 +11,6 @@ from sitl.px4.control import (
     STEP_S,
     STILL,
     Horizontal,
-    NorthEast,
     RateController,
     attitude_for,
 )
@@ -19,7 +19,16 @@ from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Px4Sticks
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
-from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
+from sitl.vehicle.rotation import (
+    IDENTITY,
+    Quat,
+    Vec3,
+    cos_tilt,
+    from_euler,
+    horizontal,
+    length,
+    yaw_of,
+)
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw command holds the heading
@@ -42,7 +51,7 @@ class Px4Control:
         self._yaw_rate_radps = 0.0
         self._yaw_hold_rad: float | None = None
         self._accel_mps2 = STILL  # last demanded, north and east
-        self._target_m: NorthEast | None = None
+        self._target_m: complex | None = None
         self._home_reached = False
         self._returns_to_m: float | None = None
         self.takeoff_to_m = 0.0  # height at which AUTO.TAKEOFF ends
@@ -121,13 +130,12 @@ class Px4Control:
             thrust = pilot.manual_thrust(sticks, self._params, HOVER_THRUST)
             return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body)
         if mode is Px4Mode.ALTCTL:
-            forward, right = pilot.lean_accel_mps2(sticks, self._params)
-            accel = from_heading(forward, right, yaw)
+            accel = pilot.lean_accel_mps2(sticks, self._params) * cmath.rect(1.0, yaw)
         elif not has_position:
             accel = STILL
         elif mode is Px4Mode.POSCTL:
-            speed = pilot.speed_mps(sticks, self._params)
-            accel = self._horizontal.steer(from_heading(*speed, yaw), body)
+            wanted = pilot.speed_mps(sticks, self._params) * cmath.rect(1.0, yaw)
+            accel = self._horizontal.steer(wanted, body)
         else:
             accel = self._horizontal.fly_to(self._destination(mode, body), body)
         self._accel_mps2 = accel
@@ -141,8 +149,8 @@ class Px4Control:
                 return self._lean_to(target, rates[2], thrust, body)
             self.attitude = body.ned_from_body_wxyz
             return self._turn_at(rates, thrust, body)
-        north, east, _ = setpoint.velocity_ned_mps
-        accel = self._accel_mps2 = self._horizontal.track((north, east), body)
+        wanted = horizontal(setpoint.velocity_ned_mps)
+        accel = self._accel_mps2 = self._horizontal.track(wanted, body)
         yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
         yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         thrust = self._climb(self._offboard_climb_mps(setpoint), body)
@@ -182,7 +190,8 @@ class Px4Control:
         max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
         accel = self._height.update(body, climb_mps, max_accel_mps2)
         thrust = thrust_for(accel, cos_tilt(body.ned_from_body_wxyz), HOVER_THRUST)
-        self.velocity_ned_mps = (*self._horizontal.speed_mps, -climb_mps)
+        speed = self._horizontal.speed_mps
+        self.velocity_ned_mps = (speed.real, speed.imag, -climb_mps)
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
 
     def _climb_mps(self, mode: Px4Mode, sticks: Px4Sticks, body: BodyState) -> float:
@@ -205,20 +214,19 @@ class Px4Control:
             return 0.0
         return -(slow + share * (fast - slow))
 
-    def _destination(self, mode: Px4Mode, body: BodyState) -> NorthEast | None:
-        """Return the target of an AUTO mode, north and east; None: stay at the resting position."""
+    def _destination(self, mode: Px4Mode, body: BodyState) -> complex | None:
+        """Return the target of an AUTO mode; None: stay at the resting position."""
         if mode is not Px4Mode.AUTO_RTL or self._home_reached:
             return self._target_m
-        north, east, down = body.position_ned_m
-        if -down > self._return_height_m(body) - ARRIVED_M:
+        if -body.position_ned_m[2] > self._return_height_m(body) - ARRIVED_M:
             self._target_m = STILL  # home
-            self._home_reached = math.hypot(north, east) < ARRIVED_M
+            self._home_reached = length(horizontal(body.position_ned_m)) < ARRIVED_M
         return self._target_m
 
     def _return_height_m(self, body: BodyState) -> float:
         """Return RTL_RETURN_ALT, or near home the height at which RTL began."""
         if self._returns_to_m is None:
-            north, east, down = body.position_ned_m
-            is_near = math.hypot(north, east) < self._params["RTL_MIN_DIST"]
-            self._returns_to_m = -down if is_near else self._params["RTL_RETURN_ALT"]
+            is_near = length(horizontal(body.position_ned_m)) < self._params["RTL_MIN_DIST"]
+            return_m = self._params["RTL_RETURN_ALT"]
+            self._returns_to_m = -body.position_ned_m[2] if is_near else return_m
         return self._returns_to_m

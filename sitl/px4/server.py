@@ -4,6 +4,7 @@ Senders are not filtered: sticks, setpoints and commands of any system are accep
 addressed to the vehicle or broadcast.
 """
 
+import cmath
 import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -25,7 +26,7 @@ from sitl.px4.modes import Px4Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
-from sitl.vehicle.rotation import Vec3, from_heading
+from sitl.vehicle.rotation import Vec3, horizontal
 
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _IGNORE_RATES = 0b111
@@ -108,8 +109,8 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             return
         velocity: Vec3 = (message.vx, message.vy, message.vz)
         if frame == mav.MAV_FRAME_BODY_NED:
-            forward, right, down = velocity
-            velocity = (*from_heading(forward, right, self._ap.yaw_rad), down)
+            level = horizontal(velocity) * cmath.rect(1.0, self._ap.yaw_rad)
+            velocity = (level.real, level.imag, message.vz)
         yaw_rate = 0.0 if mask & _IGNORE_YAW_SPEED else message.yaw_rate
         if not all(map(math.isfinite, (*velocity, yaw_rate))):
             self._log.refused_messages += 1

@@ -13,7 +13,7 @@ from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 from sitl.vehicle.firmware import HeldGesture
-from sitl.vehicle.rotation import Vec3
+from sitl.vehicle.rotation import Vec3, length
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
@@ -42,6 +42,11 @@ class Px4Sticks(NamedTuple):
     right: float = 0.0
     throttle: float = 0.0
     yaw: float = 0.0  # + nose right
+
+    @property
+    def lean(self) -> complex:
+        """Forward + 1j * right."""
+        return complex(self.forward, self.right)
 
 
 def from_manual_control(x: int, y: int, z: int, r: int) -> Px4Sticks:
@@ -184,17 +189,15 @@ def yaw_rate_radps(sticks: Px4Sticks, params: Px4Params) -> float:
     return math.radians(params["MPC_MAN_Y_MAX"]) * share
 
 
-def lean_accel_mps2(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
-    """Return ALTCTL's acceleration forward and right; both sticks share MPC_MAN_TILT_MAX."""
-    scale = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
-    scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
-    return sticks.forward * scale, sticks.right * scale
+def lean_accel_mps2(sticks: Px4Sticks, params: Px4Params) -> complex:
+    """Return ALTCTL's acceleration, forward + 1j * right; both sticks share MPC_MAN_TILT_MAX."""
+    full = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
+    return sticks.lean * (full / max(1.0, length(sticks.lean)))
 
 
 def lean_rad(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
     """Return roll and pitch (+ nose up) of STAB; both sticks share MPC_MAN_TILT_MAX."""
-    scale = math.radians(params["MPC_MAN_TILT_MAX"])
-    scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
+    scale = math.radians(params["MPC_MAN_TILT_MAX"]) / max(1.0, length(sticks.lean))
     return sticks.right * scale, -sticks.forward * scale
 
 
@@ -206,13 +209,13 @@ def acro_rates_radps(sticks: Px4Sticks, params: Px4Params) -> Vec3:
     )
 
 
-def speed_mps(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
-    """Return POSCTL's final forward and right speed; both sticks share MPC_VEL_MANUAL."""
-    length = math.hypot(sticks.forward, sticks.right)
-    if length == 0.0:
-        return 0.0, 0.0
-    speed = params["MPC_VEL_MANUAL"] * curve(min(1.0, length), params.dead_zone)
-    return speed * sticks.forward / length, speed * sticks.right / length
+def speed_mps(sticks: Px4Sticks, params: Px4Params) -> complex:
+    """Return POSCTL's final speed, forward + 1j * right; both sticks share MPC_VEL_MANUAL."""
+    deflection = length(sticks.lean)
+    if deflection == 0.0:
+        return 0j
+    speed = params["MPC_VEL_MANUAL"] * curve(min(1.0, deflection), params.dead_zone)
+    return speed * sticks.lean / deflection
 
 
 def manual_thrust(sticks: Px4Sticks, params: Px4Params, hover: float) -> float:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.rotation import Quat, Vec3, cos_tilt
+from sitl.vehicle.rotation import Quat, Vec3, cos_tilt, length
 
 GRAVITY_MPS2 = 9.80665
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
@@ -231,12 +231,14 @@ def clamp(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-def shorten(vector: tuple[float, float], limit: float) -> tuple[float, float]:
+def clamp_axes(vector: complex, limit: float) -> complex:
+    return complex(clamp(vector.real, limit), clamp(vector.imag, limit))
+
+
+def shorten(vector: complex, limit: float) -> complex:
     """Limit a vector's length and keep its direction."""
-    length = math.hypot(*vector)
-    if length <= max(0.0, limit):
-        return vector
-    return vector[0] * (limit / length), vector[1] * (limit / length)
+    size = length(vector)
+    return vector if size <= max(0.0, limit) else vector * (limit / size)
 
 
 class HeightController:

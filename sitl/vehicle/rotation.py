@@ -104,13 +104,14 @@ def yaw_of(q: Quat) -> float:
     return to_euler(q)[2]
 
 
-def from_heading(forward: float, right: float, yaw: float) -> tuple[float, float]:
-    """Rotate a horizontal vector from heading axes into north and east."""
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return forward * cy - right * sy, forward * sy + right * cy
+def horizontal(vector_ned: Vec3) -> complex:
+    """Return the horizontal part, north + 1j * east.
+
+    A product with ``cmath.rect(1.0, yaw)`` rotates forward + 1j * right into north and east.
+    """
+    return complex(vector_ned[0], vector_ned[1])
 
 
-def to_heading(north: float, east: float, yaw: float) -> tuple[float, float]:
-    """Rotate a horizontal vector from north and east into heading axes: forward, right."""
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    return north * cy + east * sy, east * cy - north * sy
+def length(vector: complex) -> float:
+    """Return the length; unlike ``abs``, it is the same with every platform's C library."""
+    return math.hypot(vector.real, vector.imag)
