@@ -74,7 +74,7 @@ class SimulatedVehicle:
     def set_receiver(self, values_us: Sequence[int]) -> None:
         """Move the pilot's sticks and switches [us]; they survive a reboot."""
         self._transmitter_us = values_us
-        self.ap.set_receiver(values_us)
+        self.ap.receiver.move(values_us)
 
     def step(self, now_ns: int) -> None:
         """Advance the simulation to ``now_ns`` in whole control steps, then queue due messages.
@@ -113,5 +113,5 @@ class SimulatedVehicle:
         for link, data in zip(self.server.links, unsent, strict=True):
             link.pass_on(data)
         if self._transmitter_us is not None:
-            self.ap.set_receiver(self._transmitter_us)
+            self.ap.receiver.move(self._transmitter_us)
         self.log.on_reboot()

@@ -5,7 +5,6 @@ see them. This module knows nothing about MAVLink, sockets or the host's time.
 """
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 
 from sitl.ardupilot.flight_modes import CopterControl, Mode
@@ -116,7 +115,7 @@ class ArduCopter(Autopilot):
     def __init__(self, params: ArduPilotParams, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
         self.mode = Mode.STABILIZE
-        self.rc = RcEngine(params, config.receiver_us)
+        self.rc = RcEngine(params, self.receiver)
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
@@ -137,9 +136,6 @@ class ArduCopter(Autopilot):
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
         return self.rc.sticks_us()
-
-    def set_receiver(self, values_us: Sequence[int]) -> None:
-        self.rc.set_receiver(values_us)
 
     @property
     def guided(self) -> GuidedControl | None:

@@ -7,18 +7,17 @@ Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_thr
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import NamedTuple
 
 from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
+from sitl.vehicle.firmware import Receiver
 
 CHANNELS = 16
 PRIMARY_CHANNELS = 8  # those that this vehicle lets be overridden; the firmware allows 16
 IGNORE = 65535
 RELEASE = 0
 
-_RECEIVER_PERIOD_NS = NS_PER_S // 50
 _OPTION_OVERRIDE_SWITCH = 46
 _OPTIONS_IGNORE_RECEIVER = 1
 _OPTIONS_IGNORE_OVERRIDES = 2
@@ -31,35 +30,24 @@ class RcEngine:
     checked, and without a receiver the sticks stay latched.
     """
 
-    def __init__(self, params: ArduPilotParams, receiver_us: Sequence[int] | None) -> None:
+    def __init__(self, params: ArduPilotParams, receiver: Receiver) -> None:
         self._params = params
-        self._receiver_us = receiver_us
-        self._has_frames = receiver_us is not None
+        self._receiver = receiver
         self._override_us = [RELEASE] * CHANNELS
         self._override_ns = [0] * CHANNELS
-        self._fresh_override = False
-        self._next_receiver_ns = 0
+        self._fresh_override = self._was_overridden = False
         self._switch = _OverrideSwitch()
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
-        self.found = receiver_us is not None  # has a receiver, or an override has come
+
+    @property
+    def found(self) -> bool:
+        """True if there is a receiver, or an override has come."""
+        return self._was_overridden or self._receiver.channels_us is not None
 
     @property
     def channel_count(self) -> int:
-        return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
-
-    def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move sticks and switches of the transmitter [us] from the next frame on.
-
-        Up to 16 channels at 50 Hz; a 0 leaves its channel unchanged. All zeros switch the
-        transmitter off: frames stop, the last values stay. A vehicle without a receiver gets one
-        with its first values.
-        """
-        self._has_frames = any(values_us)
-        if self._has_frames:
-            pairs = zip_longest(values_us[:CHANNELS], self._receiver_us or (), fillvalue=0)
-            self._receiver_us = tuple(new or old for new, old in pairs)
-            self.found = True
+        return max(PRIMARY_CHANNELS, len(self._receiver.channels_us or ()))
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
         """Apply the first eight channels of one RC_CHANNELS_OVERRIDE."""
@@ -69,7 +57,7 @@ class RcEngine:
             if value != IGNORE:
                 self._override_us[index] = value
                 self._override_ns[index] = now_ns
-                self._fresh_override = self.found = True
+                self._fresh_override = self._was_overridden = True
 
     def clear_overrides(self) -> None:
         self._override_us = [RELEASE] * CHANNELS
@@ -87,13 +75,10 @@ class RcEngine:
 
     def update(self, now_ns: int) -> bool:
         """Refresh ``channels_us``. Return True if receiver or overrides supplied a value."""
-        frame = self._has_frames and now_ns >= self._next_receiver_ns
-        if not (frame or self._fresh_override):
+        if self._receiver.frame(now_ns) is None and not self._fresh_override:
             self._watch_switch(now_ns)
             return False
         self._fresh_override = False
-        if frame:
-            self._next_receiver_ns = now_ns + _RECEIVER_PERIOD_NS
         values = [self._source(index, now_ns) for index in range(CHANNELS)]
         for index, value in enumerate(values):
             if value is not None:
@@ -109,9 +94,10 @@ class RcEngine:
         is_allowed = is_alive and not options & _OPTIONS_IGNORE_OVERRIDES
         if self._override_us[index] != RELEASE and is_allowed:
             return self._override_us[index]
-        if self._receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
+        receiver_us = self._receiver.channels_us
+        if receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
             return None
-        return self._receiver_us[index] if index < len(self._receiver_us) else 0
+        return receiver_us[index] if index < len(receiver_us) else 0
 
     def _watch_switch(self, now_ns: int) -> None:
         for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):

@@ -37,7 +37,7 @@ class Pilot(Protocol):
     """Source of receiver values. The vehicle's loop polls it; it never waits."""
 
     def latest(self) -> Sequence[int] | None:
-        """Return the channels [us] for ``Autopilot.set_receiver``; None: unchanged."""
+        """Return the channels [us] for ``Receiver.move``; None: unchanged."""
 
     def close(self) -> None: ...
 

@@ -5,7 +5,6 @@ links, sockets or the host's time.
 """
 
 import math
-from collections.abc import Sequence
 
 from sitl.clock import NS_PER_S
 from sitl.px4.commander import Commander
@@ -17,7 +16,6 @@ from sitl.px4.sticks import RC_SOURCE, Px4Sticks
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.firmware import STOPPED
 
-RECEIVER_PERIOD_NS = NS_PER_S // 50
 RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground
 TAKEOFF_MARGIN_M = 0.2  # AUTO.TAKEOFF has arrived this far below its height
 
@@ -36,10 +34,7 @@ class Px4(Commander):
 
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
-        self.receiver_us = config.receiver_us
         self.flight = Px4Control(params)
-        self._has_transmitter = config.receiver_us is not None
-        self._receiver_due_ns = boot_ns
         self._ramp_ns: int | None = None  # start of the takeoff ramp; None: no ramp
         self._flown_mode = self.mode
 
@@ -52,12 +47,6 @@ class Px4(Commander):
         axes = (sticks.right, -sticks.forward, sticks.throttle, sticks.yaw)
         roll, pitch, throttle, yaw = (1500 + round(500.0 * value) for value in axes)
         return roll, pitch, throttle, yaw
-
-    def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the transmitter's sticks [us, by channel]; all zeros switch it off."""
-        self._has_transmitter = any(values_us)
-        if self._has_transmitter:
-            self.receiver_us = tuple(values_us)
 
     def prepare_takeoff(self, height_m: float | None) -> None:
         above_m = self.params["MIS_TAKEOFF_ALT"] - self.sensed.position_ned_m[2]
@@ -86,16 +75,13 @@ class Px4(Commander):
 
     def _read_receiver(self) -> None:
         """Feed the receiver's four mapped channels to the stick input as one more source."""
-        if self.receiver_us is None or not self._has_transmitter:
+        if (frame_us := self.receiver.frame(self.now_ns)) is None:
             return
-        if self.now_ns < self._receiver_due_ns:
-            return
-        self._receiver_due_ns = self.now_ns + RECEIVER_PERIOD_NS
         channels = [
             self.params.integer(f"RC_MAP_{axis}") for axis in ("PITCH", "ROLL", "THROTTLE", "YAW")
         ]
-        if all(1 <= channel <= len(self.receiver_us) for channel in channels):
-            values = [(self.receiver_us[channel - 1] - 1500) / 500.0 for channel in channels]
+        if all(1 <= channel <= len(frame_us) for channel in channels):
+            values = [(frame_us[channel - 1] - 1500) / 500.0 for channel in channels]
             pitch, roll, throttle, yaw = (max(-1.0, min(1.0, value)) for value in values)
             sticks = Px4Sticks(forward=-pitch, right=roll, throttle=throttle, yaw=yaw)
             self.stick_input.on_sticks(RC_SOURCE, sticks, self.now_ns)

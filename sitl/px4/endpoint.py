@@ -123,7 +123,7 @@ class Px4Telemetry(Telemetry[Px4]):
 
     def rc_channels(self) -> Fields | None:
         """A receiver's channels; MANUAL_CONTROL never shows here."""
-        if (receiver_us := self.ap.receiver_us) is None:
+        if (receiver_us := self.ap.receiver.channels_us) is None:
             return None
         channels = (*receiver_us, *[65535] * 18)[:18]
         return (self.boot_ms, len(receiver_us), *channels, 100)

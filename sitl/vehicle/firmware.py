@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
+from itertools import zip_longest
 from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -22,6 +23,7 @@ from sitl.vehicle.rotation import Quat, Vec3, yaw_of
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 LANDED_AFTER_NS = NS_PER_S
 LANDED_SPEED_MPS = 0.3
+RECEIVER_PERIOD_NS = NS_PER_S // 50
 _INT32_LIMIT = 1 << 31
 
 
@@ -72,6 +74,33 @@ class HeldGesture:
             return 0
         self._since_ns = None
         return self._side
+
+
+class Receiver:
+    """RC receiver that hears the pilot's transmitter at 50 Hz."""
+
+    def __init__(self, channels_us: Sequence[int] | None) -> None:
+        self.channels_us = channels_us  # last channels; None: no receiver
+        self._has_signal = channels_us is not None
+        self._due_ns = 0
+
+    def move(self, values_us: Sequence[int]) -> None:
+        """Move sticks and switches of the transmitter [us] from the next frame on.
+
+        A 0 leaves its channel unchanged. All zeros switch the transmitter off: frames stop, the
+        last values stay. A vehicle without a receiver gets one with its first values.
+        """
+        self._has_signal = any(values_us)
+        if self._has_signal:
+            pairs = zip_longest(values_us, self.channels_us or (), fillvalue=0)
+            self.channels_us = tuple(new or old for new, old in pairs)
+
+    def frame(self, now_ns: int) -> Sequence[int] | None:
+        """Return the channels [us] once for each frame, when it is due."""
+        if not self._has_signal or now_ns < self._due_ns:
+            return None
+        self._due_ns = now_ns + RECEIVER_PERIOD_NS
+        return self.channels_us
 
 
 def float32(value: float) -> float:
@@ -163,6 +192,7 @@ class Autopilot(ABC):
         self.now_ns = boot_ns  # time of the last control step
         self.armed = False
         self.landed = True
+        self.receiver = Receiver(config.receiver_us)
         self.position_lost = False
         """Injected fault: the estimator has no horizontal position while this is set."""
         self.texts: list[StatusText] = []
@@ -192,10 +222,6 @@ class Autopilot(ABC):
 
         1500 is centred. Smaller is left, nose down and descent, as in ArduCopter.
         """
-
-    @abstractmethod
-    def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches [us, by channel]; all zeros: transmitter off."""
 
     @property
     def step_s(self) -> float:

@@ -14,6 +14,7 @@ from sitl.ardupilot.rc import (
     yaw_rate_radps,
 )
 from sitl.vehicle.conditions import Conditions
+from sitl.vehicle.firmware import Receiver
 
 PX4_DEFAULTS = {
     "MPC_MAN_TILT_MAX": 35.0,
@@ -63,7 +64,7 @@ def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
     """Return the motion of the simulated copter's own code for these sticks, as PWM on the wire."""
     params = ArduPilotParams(conditions)
     channels = calibration({name: params[name] for name in params.names})
-    rc = RcEngine(params, None)
+    rc = RcEngine(params, Receiver(None))
     for channel, pwm_us in zip(channels.channels, channels.to_pwm_us(sticks), strict=True):
         rc.channels_us[channel.number - 1] = pwm_us
     read = read_sticks(rc, params)

@@ -11,23 +11,25 @@ from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine, read_sticks
 from sitl.clock import NS_PER_MS
 from sitl.vehicle.config import IDLE_RECEIVER_US
+from sitl.vehicle.firmware import Receiver
 
 KEEP = 65535
 
 
-def engine(*, receiver=True, **params):
+def engine(**params):
     store = ArduPilotParams()
     for name, value in params.items():
         assert store.set(name, value)
-    return RcEngine(store, IDLE_RECEIVER_US if receiver else None), store
+    return RcEngine(store, Receiver(IDLE_RECEIVER_US)), store
 
 
 def test_a_receiver_may_turn_up_later():
-    rc, _ = engine(receiver=False)
-    rc.set_receiver([0] * 8)
+    receiver = Receiver(None)
+    rc = RcEngine(ArduPilotParams(), receiver)
+    receiver.move([0] * 8)
     assert not rc.update(0)
     assert not rc.found
-    rc.set_receiver([1500] * 8)
+    receiver.move([1500] * 8)
     assert rc.update(NS_PER_MS)
     assert rc.found
     assert rc.channels_us[:8] == [1500] * 8
