@@ -139,6 +139,7 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
 
 
 HEARTBEAT_INTERVAL_MS = 1000
+SHORTEST_INTERVAL_MS = 3  # 1 / (0.8 * SCHED_LOOP_RATE) in whole milliseconds, at 400 Hz
 MAX_INTERVAL_US = 60_000_000
 MAX_DISTINCT_INTERVALS = 10
 TIMESYNC_PERIOD_NS = 10 * NS_PER_S
@@ -199,7 +200,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         refusal = None
         if message_id not in ArduPilotTelemetry.names:
             refusal = f"No ap_message for mavlink id ({message_id})"
-        elif 0 < interval_ms < self._shortest_ms:
+        elif 0 < interval_ms < SHORTEST_INTERVAL_MS:
             refusal = f"Requested rate for message ID {message_id} too fast. "
             refusal += "Increase SCHED_LOOP_RATE"
         if refusal is not None:
@@ -210,7 +211,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
 
     def set_group(self, group: int, rate_hz: int) -> None:
         """Apply REQUEST_DATA_STREAM, which replaces earlier intervals. Rate 0 stops the group."""
-        interval_ms = max(1000 // rate_hz, self._shortest_ms) if rate_hz > 0 else 0
+        interval_ms = max(1000 // rate_hz, SHORTEST_INTERVAL_MS) if rate_hz > 0 else 0
         for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
             for message_id in STREAM_GROUPS.get(one, ()):
                 self._start(message_id, interval_ms)
@@ -221,11 +222,6 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
             return 0
         stream = self._streams.get(message_id)
         return stream.interval_ms * 1000 if stream else -1
-
-    @property
-    def _shortest_ms(self) -> int:
-        """Shortest interval, 1 / (0.8 * loop rate) in whole milliseconds: 3 ms at 400 Hz."""
-        return int(1000.0 / (0.8 * max(50.0, self._ap.params["SCHED_LOOP_RATE"])))
 
     def _due(self) -> list[int]:
         """Return the ids of the messages to send now; after missed slots, each is sent once."""

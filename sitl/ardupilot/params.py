@@ -46,7 +46,6 @@ _FIXED = {
     "RC_OPTIONS": 32.0,  # bit 0 ignore receiver, 1 ignore overrides, 6 no neutral-stick check
     "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
     "RTL_ALT": 1500.0,  # cm
-    "SCHED_LOOP_RATE": 400.0,  # Hz; bounds the message rates
     "SIMPLE": 0.0,  # stored only: the sticks keep the vehicle's axes
     "SUPER_SIMPLE": 0.0,
     "WPNAV_ACCEL_Z": 100.0,  # cm/s^2

@@ -35,8 +35,6 @@ _CURRENT_MODE = struct.Struct("<IIB")
 
 _FIRMWARE_VERSIONS: dict[Px4Release, int] = {
     "1.14": 0x010E04FF,
-    "1.15": 0x010F04FF,
-    "1.16": 0x011001FF,
     "1.17": 0x011100FF,
     "1.18": 0x01120080,  # beta
 }

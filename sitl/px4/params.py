@@ -70,8 +70,6 @@ _OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVE
 _ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
     {
         "1.14": (*_NEW_OVERRIDE, DEAD_ZONE),
-        "1.15": (*_NEW_OVERRIDE, DEAD_ZONE),
-        "1.16": (*_NEW_OVERRIDE, DEAD_ZONE),
         "1.17": _NEW_OVERRIDE,
         "1.18": _OLD_OVERRIDE,
     }

@@ -18,7 +18,7 @@ ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev"]
 """ArduPilot release for the names of parameters; 4.5 has those of 4.6. The measured firmware,
 4.7-dev, has the new names of the system ids and the old names of the rest."""
 
-Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]
+Px4Release: TypeAlias = Literal["1.14", "1.17", "1.18"]
 """PX4 release for parameters, stick override and messages; 1.18 was measured."""
 
 SIGNING_TICK_NS = 10_000
