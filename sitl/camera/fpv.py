@@ -312,11 +312,8 @@ def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
     """Return the rotation [3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
     sine, cosine = math.sin(conditions.camera_tilt_rad), math.cos(conditions.camera_tilt_rad)
     tilted = np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
-    roll_rad, yaw_rad = conditions.camera_roll_rad, conditions.camera_yaw_rad
-    if roll_rad == 0.0 and yaw_rad == 0.0:
-        return tilted
-    about_axis = rotation_matrix(from_euler(0.0, 0.0, roll_rad))
-    about_down = rotation_matrix(from_euler(0.0, 0.0, yaw_rad))
+    about_axis = rotation_matrix(from_euler(0.0, 0.0, conditions.camera_roll_rad))
+    about_down = rotation_matrix(from_euler(0.0, 0.0, conditions.camera_yaw_rad))
     return np.asarray(about_down @ tilted @ about_axis)
 
 

@@ -33,6 +33,8 @@ STRAY_TURN_RAD = math.radians(120.0)
 STRAY_CLEARANCE_M = 4.5
 """Smallest distance of a stray gate from all gates of the course, or it is left out."""
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
+_QUARTER_TURN = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""Turns rows of forward, right and down about the passage: right becomes down."""
 
 RIDGE_SEGMENTS = 120
 RIDGE_ELEVATION_RAD = (math.radians(0.8), math.radians(6.5))
@@ -48,8 +50,8 @@ BACKDROP_RISES = (-1.0, -0.30, -0.05, 0.0, 0.10, 0.40, 1.0)
 class _Face(NamedTuple):
     """One quadrilateral in gate axes: forward through the gate, right, down."""
 
-    corners_m: tuple[Vec3, ...]
-    normal: Vec3  # towards the visible side; zero = visible from both sides
+    corners_m: ArrayLike
+    normal: ArrayLike  # towards the visible side; zero = visible from both sides
     rgb: ArrayLike
 
 
@@ -153,6 +155,7 @@ def _faces_of(gate: Gate, look: Conditions) -> list[_Face]:
     to_ground_m = (outer_m, -gate.center_ned_m[2])
     number_m = (-middle_m - look.pip_m / 2, -middle_m + look.pip_m / 2)
     pips = [(k - gate.index / 2) * PIP_PITCH_M for k in range(gate.index + 1) if look.pip_m]
+    backs = np.array([look.gate_back_rgb] * 2, dtype=float)
     back, front = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
     return [
         *(
@@ -160,10 +163,10 @@ def _faces_of(gate: Gate, look: Conditions) -> list[_Face]:
             for m in (-middle_m, middle_m)
             if look.leg_m
         ),
-        *_tube(inner_m, half_m, (0.0, 0.0, 1.0), inside),
-        *_tube(outer_m, half_m, (0.0, 0.0, -1.0), inside),
-        *_ring(outer_m, inner_m, half_m, back, np.array([look.gate_back_rgb] * 2, dtype=float)),
-        *_ring(outer_m, inner_m, -half_m, front, paints),
+        *_ring((-half_m, inner_m), (half_m, inner_m), (0.0, 0.0, 1.0), inside),
+        *_ring((-half_m, outer_m), (half_m, outer_m), (0.0, 0.0, -1.0), inside),
+        *_ring((half_m, outer_m), (half_m, inner_m), back, backs),
+        *_ring((-half_m, outer_m), (-half_m, inner_m), front, paints),
         *(_Face(_upright(-half_m, m, look.pip_m, number_m), front, look.pip_rgb) for m in pips),
     ]
 
@@ -182,45 +185,28 @@ def _upright(
     )
 
 
-def _tube(half_m: float, depth_m: float, top_normal: Vec3, paints: FloatArray) -> list[_Face]:
-    """Return the walls of a square tube along the passage, given the normal of its top wall."""
-    top = (
-        (-depth_m, -half_m, -half_m),
-        (-depth_m, half_m, -half_m),
-        (depth_m, half_m, -half_m),
-        (depth_m, -half_m, -half_m),
-    )
-    return _quarter_turns(top, top_normal, paints)
-
-
 def _ring(
-    outer_m: float, inner_m: float, forward_m: float, normal: Vec3, paints: FloatArray
+    one: tuple[float, float], other: tuple[float, float], top_normal: Vec3, paints: FloatArray
 ) -> list[_Face]:
-    """Return the front or back of the frame around the opening, in four parts."""
-    top = (
-        (forward_m, -outer_m, -outer_m),
-        (forward_m, outer_m, -outer_m),
-        (forward_m, inner_m, -inner_m),
-        (forward_m, -inner_m, -inner_m),
-    )
-    return _quarter_turns(top, normal, paints)
+    """Return the four faces between two squares around the passage's axis, the top one first.
 
-
-def _quarter_turns(top_m: tuple[Vec3, ...], normal: Vec3, paints: FloatArray) -> list[_Face]:
-    """Return a face and its copies, turned about the passage by one to three quarter turns.
-
-    ``paints`` [2, 3] is the colour of top and bottom, then that of the sides.
+    A square is given by its place along the passage and half its side. ``paints`` [2, 3] is the
+    colour of top and bottom, then that of the sides.
     """
-    faces = [_Face(top_m, normal, paints[0])]
-    for rgb in (paints[1], paints[0], paints[1]):
-        corners_m, normal, _ = faces[-1]
-        faces.append(_Face(tuple(map(_quarter_turn, corners_m)), _quarter_turn(normal), rgb))
-    return faces
-
-
-def _quarter_turn(vector: Vec3) -> Vec3:
-    forward, right, down = vector
-    return (forward, -down, right)
+    (one_m, one_half_m), (other_m, other_half_m) = one, other
+    top_m = np.array(
+        [
+            (one_m, -one_half_m, -one_half_m),
+            (one_m, one_half_m, -one_half_m),
+            (other_m, other_half_m, -other_half_m),
+            (other_m, -other_half_m, -other_half_m),
+        ]
+    )
+    turns = [np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)]
+    return [
+        _Face(top_m @ turn, np.array(top_normal) @ turn, paints[k % 2])
+        for k, turn in enumerate(turns)
+    ]
 
 
 def ridge_directions(seed: int) -> FloatArray:

@@ -38,11 +38,7 @@ PAINTS: tuple[Hsv, ...] = (
 
 
 def training_conditions(seed: int) -> Conditions:
-    """Return ``random_conditions``, in two flights of three with other colours and objects.
-
-    Raises:
-        UsageError: a negative seed.
-    """
+    """Return ``random_conditions``, in two flights of three with other colours and objects."""
     conditions = random_conditions(seed)
     draw = Draw(np.random.Generator(np.random.PCG64((seed, 11))))
     if draw.chance(PLAIN_SHARE):
@@ -58,9 +54,6 @@ def held_out_conditions(seed: int) -> Conditions:
 
     One seed in five each: gates partly hidden by panels; gates in shadow over high-contrast ground;
     night with shining gates; a low sun in the lens; stray gates beside the path.
-
-    Raises:
-        UsageError: a negative seed.
     """
     conditions = random_conditions(seed)
     draw = Draw(np.random.Generator(np.random.PCG64((seed, 7))))
@@ -77,11 +70,7 @@ def held_out_conditions(seed: int) -> Conditions:
 
 
 def unseen_conditions(seed: int) -> Conditions:
-    """Return ``random_conditions`` in dense fog (even seeds) or through a dirty lens (odd seeds).
-
-    Raises:
-        UsageError: a negative seed.
-    """
+    """Return ``random_conditions`` in dense fog (even seeds) or through a dirty lens (odd)."""
     conditions = random_conditions(seed)
     draw = Draw(np.random.Generator(np.random.PCG64((seed, 12))))
     if seed % 2:
