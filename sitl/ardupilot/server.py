@@ -139,8 +139,14 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             return FAILED
         return ACCEPTED if self._ap.set_mode(mode) else FAILED
 
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return self._to_mode(Mode.RTL)
+
+    def cmd_nav_land(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return self._to_mode(Mode.LAND)
+
     def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
-        if not all(map(math.isfinite, params[:2])):
+        if not _are_finite(params[:2]):
             return DENIED
         if not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
             return DENIED
@@ -169,6 +175,10 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             return UNSUPPORTED
         self.reboot_requested = True
         return ACCEPTED
+
+
+def _are_finite(params: Params7) -> bool:
+    return all(map(math.isfinite, params))
 
 
 def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:

@@ -102,8 +102,10 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         self, link: Px4Endpoint, message: Message, arrived_ns: int
     ) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
-        is_supported = frame in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED)
-        if not is_supported or mask & _IGNORE_VELOCITY:
+        if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
+            self._ap.refuse_frame(frame)
+            return
+        if mask & _IGNORE_VELOCITY:
             return
         velocity: Vec3 = (message.vx, message.vy, message.vz)
         if frame == mav.MAV_FRAME_BODY_NED:
@@ -121,19 +123,30 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             self._log.setpoints.add(arrived_ns)
 
     def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
-        """Execute a command; a refused mode is sent as a text to ground stations only."""
-        if message.command != mav.MAV_CMD_DO_SET_MODE:
-            return super()._execute(message, params, link)
-        if not all(map(math.isfinite, params[:3])):
+        if message.command == mav.MAV_CMD_DO_SET_MODE:
+            return self._change_mode(message, *params[:3])
+        return super()._execute(message, params, link)
+
+    def _change_mode(self, message: Message, base_mode: float, main: float, sub: float) -> int:
+        """Change to a custom mode; send the refusal as a text to ground stations only."""
+        if not all(map(math.isfinite, (base_mode, main, sub))):
             return REJECTED
-        base_mode, main, sub = map(int, params[:3])
-        mode = mode_of(main, sub)
-        if not base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
+        mode = mode_of(int(main), int(sub))
+        if not int(base_mode) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
             return REJECTED
+        is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
+        return self._to_mode(mode, says_why=is_station)
+
+    def _to_mode(self, mode: Px4Mode, *, says_why: bool = True) -> int:
         if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
-        is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
-        return ACCEPTED if self._ap.set_mode(mode, says_why=is_station) else REJECTED
+        return ACCEPTED if self._ap.set_mode(mode, says_why=says_why) else REJECTED
+
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return self._to_mode(Px4Mode.AUTO_RTL)
+
+    def cmd_nav_land(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return self._to_mode(Px4Mode.AUTO_LAND)
 
     def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
         if params[0] not in (0.0, 1.0):

@@ -80,6 +80,7 @@ def test_nan_in_a_message_is_refused_and_counted(station):
         (mav.MAV_CMD_GET_MESSAGE_INTERVAL, (70_000,), mav.MAV_RESULT_DENIED),
         (mav.MAV_CMD_REQUEST_MESSAGE, (148,), mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_REQUEST_MESSAGE, (331,), mav.MAV_RESULT_FAILED),
+        (mav.MAV_CMD_NAV_LAND, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1,), mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (2,), mav.MAV_RESULT_UNSUPPORTED),
         (mav.MAV_CMD_NAV_TAKEOFF, (), mav.MAV_RESULT_FAILED),
