@@ -14,9 +14,11 @@ from sitl.clock import NS_PER_S
 from sitl.vehicle.firmware import Receiver
 
 CHANNELS = 16
-PRIMARY_CHANNELS = 8  # those that this vehicle lets be overridden; the firmware allows 16
+PRIMARY_CHANNELS = 8  # 0 and the highest values mean something else on channels 9-16
 IGNORE = 65535
-RELEASE = 0
+RELEASE_ON_AUX = 65534  # releases channels 9-16; an ordinary value on 1-8
+RELEASE = 0  # releases channels 1-8; means "ignore" on 9-16
+AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 
 _OPTION_OVERRIDE_SWITCH = 46
 _OPTIONS_IGNORE_RECEIVER = 1
@@ -50,14 +52,32 @@ class RcEngine:
         return max(PRIMARY_CHANNELS, len(self._receiver.channels_us or ()))
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
-        """Apply the first eight channels of one RC_CHANNELS_OVERRIDE."""
-        if not self._switch.enabled:
+        """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
+        for index, value in enumerate(raw_us[:CHANNELS]):
+            if index < PRIMARY_CHANNELS:
+                if value != IGNORE:
+                    self._set(index, value, now_ns)
+            elif value == RELEASE_ON_AUX:
+                self._set(index, RELEASE, now_ns)
+            elif value not in (RELEASE, IGNORE):
+                self._set(index, value, now_ns)
+
+    def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
+        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward and so a lower PWM."""
+        if z < 0:
             return
-        for index, value in enumerate(raw_us[:PRIMARY_CHANNELS]):
-            if value != IGNORE:
-                self._override_us[index] = value
-                self._override_ns[index] = now_ns
-                self._fresh_override = self._was_overridden = True
+        axes = (
+            ("ROLL", y, y + 1000, 2000),
+            ("PITCH", x, 1000 - x, 2000),
+            ("YAW", r, r + 1000, 2000),
+            ("THROTTLE", z, z, 1000),
+        )
+        for axis, value, travel, full in axes:
+            index = self.index_of(axis)
+            low = self._params.integer(f"RC{index + 1}_MIN")
+            high = self._params.integer(f"RC{index + 1}_MAX")
+            pwm = low + (high - low) * travel // full & 0xFFFF  # stored without a range check
+            self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
 
     def clear_overrides(self) -> None:
         self._override_us = [RELEASE] * CHANNELS
@@ -98,6 +118,13 @@ class RcEngine:
         if receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
             return None
         return receiver_us[index] if index < len(receiver_us) else 0
+
+    def _set(self, index: int, value_us: int, now_ns: int) -> None:
+        if not self._switch.enabled:
+            return
+        self._override_us[index] = value_us
+        self._override_ns[index] = now_ns
+        self._fresh_override = self._was_overridden = True
 
     def _watch_switch(self, now_ns: int) -> None:
         for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):

@@ -20,6 +20,7 @@ from sitl.link.server import (
     DENIED,
     FAILED,
     FORCE,
+    MAX_RC_FIELDS,
     UNSUPPORTED,
     MavlinkServer,
     Params7,
@@ -87,12 +88,25 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if not self._is_from_gcs(message):
             return
         self._ap.gcs_failsafe.on_contact(arrived_ns)
-        raw_us = [getattr(message, f"chan{n}_raw") for n in range(1, PRIMARY_CHANNELS + 1)]
-        if set(raw_us) - {RELEASE, IGNORE}:
+        raw_us = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
+        primary = set(raw_us[:PRIMARY_CHANNELS])
+        if primary - {RELEASE, IGNORE}:
             self._log.overrides.add(arrived_ns)
-        elif RELEASE in raw_us:
+        elif RELEASE in primary:
             self._log.releases += 1
         self._ap.rc.override(raw_us, arrived_ns)
+
+    def on_manual_control(
+        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
+    ) -> None:
+        is_for_us = message.target == self._ap.system_id
+        if not is_for_us or not self._is_from_gcs(message):
+            return
+        self._ap.gcs_failsafe.on_contact(arrived_ns)
+        self._log.manual_controls.add(arrived_ns)
+        self._ap.rc.manual_control(
+            x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
+        )
 
     def on_set_attitude_target(
         self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int

@@ -128,6 +128,7 @@ UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrides a refusal (MAVLink common.xml)
 UINT16_MAX = 65535
+MAX_RC_FIELDS = 18
 COMMAND_FIELDS = {
     "COMMAND_LONG": tuple(f"param{n}" for n in range(1, 8)),
     "COMMAND_INT": ("param1", "param2", "param3", "param4", "x", "y", "z"),

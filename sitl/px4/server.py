@@ -14,9 +14,11 @@ from sitl.link.server import (
     DENIED,
     FAILED,
     FORCE,
+    MAX_RC_FIELDS,
     REJECTED,
     MavlinkServer,
     Params7,
+    send_ack,
 )
 from sitl.link.telemetry import Message
 from sitl.px4.autopilot import Px4
@@ -28,6 +30,7 @@ from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import Vec3, horizontal
 
+_RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _IGNORE_RATES = 0b111
 _IGNORE_YAW_RATE = 0b100
@@ -82,6 +85,14 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
 
+    def on_rc_channels_override(
+        self, _link: Px4Endpoint, message: Message, arrived_ns: int
+    ) -> None:
+        """Treat the values as those of a receiver; PX4 has no override."""
+        self._log.overrides.add(arrived_ns)
+        values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
+        self._ap.receiver.move([0 if value == _RC_IGNORE else value for value in values])
+
     def on_set_attitude_target(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
         mask = message.type_mask
         rates: Vec3 = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
@@ -121,6 +132,12 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         self._ap.set_setpoint(setpoint, arrived_ns)
         if self._ap.mode_name == "OFFBOARD":
             self._log.setpoints.add(arrived_ns)
+
+    def on_set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+        """Change the mode by SET_MODE, acknowledged as DO_SET_MODE, which replaced it."""
+        main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
+        result = self._change_mode(message, message.base_mode, main, sub)
+        send_ack(link, message, mav.MAV_CMD_DO_SET_MODE, result)
 
     def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
         if message.command == mav.MAV_CMD_DO_SET_MODE:
