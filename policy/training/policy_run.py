@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import update_bn
 
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import FLIGHT_TERMS
@@ -29,7 +30,7 @@ from policy.training.batches import (
 from policy.training.report import Hooks, PolicyValidation, TrainResult
 from policy.training.run import TrainingRun, computing_in, work_folder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
-from policy.training.trainee import Trainee, refresh_batch_norm, validate
+from policy.training.trainee import Trainee, validate
 
 VALIDATION_SAMPLES = 256
 NORM_IMAGES = 1024
@@ -107,11 +108,15 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         )
 
     def _refresh_batch_norm(self, every: Indices) -> None:
+        """Recompute the batch norms' statistics from plain images.
+
+        The old ones were averaged while the weights changed, and fit neither weights nor images.
+        """
         count = min(NORM_IMAGES, len(every))
         chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
         parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
         with computing_in(self.device, self.bf16):
-            refresh_batch_norm(self.trainee, (self._images(part, False) for part in parts))
+            update_bn((self._images(part, False) for part in parts), self.trainee.policy.backbone)
 
     @torch.inference_mode()
     def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:

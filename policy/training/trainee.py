@@ -138,27 +138,6 @@ def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
-    """Recompute the batch norms' statistics from images [B, 3, height, width].
-
-    The old ones were averaged while the weights changed, and fit neither weights nor plain images.
-    """
-    norms = [m for m in trainee.policy.backbone.modules() if isinstance(m, nn.BatchNorm2d)]
-    if not norms:
-        return
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # a plain average over all batches
-        norm.train()
-    for image in batches:
-        trainee.policy.backbone(image)
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum
-        norm.eval()
-
-
-@torch.no_grad()
 def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     """Return losses and stick errors over all ``batches`` of features, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
