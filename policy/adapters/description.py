@@ -20,7 +20,7 @@ from policy.files import (
     CONTRACT_FILE,
     decode_text,
     last_line,
-    parse_json,
+    parse_object,
     read_text,
     stand_in,
     why_unreadable,
@@ -100,13 +100,9 @@ def describe(
 
 
 def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
-    try:
-        data: Any = parse_json(text)
-    except ValueError as error:
-        raise CheckpointError(f"{where} is not JSON: {error}") from error
-    if not isinstance(data, dict) or not set(data) <= set(TABLES):
-        there = sorted(data) if isinstance(data, dict) else type(data).__name__
-        raise CheckpointError(f"{where} must be an object of {list(TABLES)}, not {there}")
+    data = parse_object(text, CheckpointError, str(where))
+    if not set(data) <= set(TABLES):
+        raise CheckpointError(f"{where} must be an object of {list(TABLES)}, not {sorted(data)}")
     if wrong := [name for name, value in data.items() if not isinstance(value, dict)]:
         raise CheckpointError(f"{where}: {wrong} must be objects")
     return data

@@ -16,7 +16,6 @@ import warnings
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +41,7 @@ from policy.checkpoints.tensors import (
 from policy.contract import Contract, FloatArray
 from policy.engines.choose import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
-from policy.files import why_unreadable
+from policy.files import parse_object, why_unreadable
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.nets.world_model.config import WorldModelConfig
@@ -104,10 +103,8 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
         require_header(path, header)
         try:
             config = _config_of(header, type(fallback))
-        except (PolicyError, RecursionError) as error:
-            is_ours = isinstance(error, PolicyError)
-            told = str(error) if is_ours else "its header is nested too deeply"
-            raise CheckpointError(f"{path}: {told}") from error
+        except PolicyError as error:
+            raise CheckpointError(f"{path}: {error}") from error
         vector = {
             name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
             for name in list(tensors)
@@ -171,12 +168,12 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
 
 def _config_of(header: dict[str, str], wanted: type[BuiltinConfig]) -> BuiltinConfig:
     contract, text = Contract.from_json(header[CONTRACT_KEY]), header[ARCHITECTURE_KEY]
+    data = parse_object(text, CheckpointError, "malformed architecture: it")
     try:
-        data: Any = json.loads(text)
         if (kind := data.pop("policy")) != wanted.kind:
             raise CheckpointError(f"it holds a {kind}, no {wanted.kind}: fly it by --policy {kind}")
         return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError) as error:
         raise CheckpointError(
             f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
@@ -238,7 +235,7 @@ def load_world_model(path: Path) -> WorldModel:
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
         config = WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract)
-    except (PolicyError, RecursionError) as error:
+    except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error
     return load_fitting(
         *(path, partial(WorldModel, config), state),

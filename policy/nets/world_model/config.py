@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 
 from policy.contract import Contract
 from policy.errors import PolicyError
+from policy.files import parse_object
 from policy.nets.diffusion import NoiseSchedule
 
 FACTOR = 8
@@ -65,13 +66,10 @@ class WorldModelConfig:
     @classmethod
     def from_json(cls, text: str, contract: Contract) -> "WorldModelConfig":
         """Read the header form."""
+        data = parse_object(text, PolicyError, "malformed world model: it")
         try:
-            data = json.loads(text)
             data["schedule"] = NoiseSchedule(**data["schedule"])
             data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
             return cls(contract=contract, **data)
-        except (
-            *(PolicyError, ArithmeticError, LookupError),
-            *(TypeError, ValueError, RecursionError),
-        ) as error:
+        except (PolicyError, ArithmeticError, LookupError, TypeError, ValueError) as error:
             raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error
