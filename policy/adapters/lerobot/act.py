@@ -5,6 +5,7 @@ have LeRobot's names, except in the attention layers.
 """
 
 import math
+from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
@@ -63,7 +64,9 @@ class DecoderLayer(EncoderLayer):
         self.norm3 = nn.LayerNorm(config.dim_model)
         self.multihead_attn = Attention(config.dim_model, config.n_heads)
 
-    def decode(self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor) -> Tensor:
+    def forward(  # type: ignore[override]
+        self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
+    ) -> Tensor:
         """Decode actions [B, L, D] and tokens [B, M, D], each with its positions."""
         x = self.attend(x, position)
         query = self.before(x, self.norm2) + position
@@ -71,36 +74,17 @@ class DecoderLayer(EncoderLayer):
         return self.feed_forward(x, self.norm3)
 
 
-class Encoder(nn.Module):
-    """Encoder layers, with a final norm if norms come first."""
+class Stack(nn.Module):
+    """Layers, and a norm after the last one."""
 
-    def __init__(self, config: ActConfig) -> None:
+    def __init__(self, layers: Iterable[nn.Module], norm: nn.Module) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.n_encoder_layers))
-        self.norm: nn.Module = nn.LayerNorm(config.dim_model) if config.pre_norm else nn.Identity()
+        self.layers, self.norm = nn.ModuleList(layers), norm
 
-    def forward(self, x: Tensor, position: Tensor) -> Tensor:
-        """Encode [B, L, D] -> [B, L, D]."""
+    def forward(self, x: Tensor, *others: Tensor) -> Tensor:
+        """Apply all to [B, L, D]; ``others`` are the further arguments of each layer."""
         for layer in self.layers:
-            x = layer(x, position)
-        out: Tensor = self.norm(x)
-        return out
-
-
-class Decoder(nn.Module):
-    """Decoder layers and a final norm."""
-
-    def __init__(self, config: ActConfig) -> None:
-        super().__init__()
-        self.layers = nn.ModuleList(DecoderLayer(config) for _ in range(config.n_decoder_layers))
-        self.norm = nn.LayerNorm(config.dim_model)
-
-    def forward(
-        self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
-    ) -> Tensor:
-        """Decode by every layer; arguments as in ``DecoderLayer.decode``."""
-        for layer in self.layers:
-            x = layer.decode(x, position, tokens, token_position)  # type: ignore[operator]
+            x = layer(x, *others)
         out: Tensor = self.norm(x)
         return out
 
@@ -123,7 +107,10 @@ class Act(nn.Module):
         self.encoder_latent_input_proj = nn.Linear(config.latent_dim, dim)
         self.encoder_robot_state_input_proj = nn.Linear(state_dim, dim) if state_dim else None
         self.encoder_1d_feature_pos_embed = nn.Embedding(2 if state_dim else 1, dim)
-        self.encoder, self.decoder = Encoder(config), Decoder(config)
+        norm = nn.LayerNorm(dim) if config.pre_norm else nn.Identity()
+        self.encoder = Stack((EncoderLayer(config) for _ in range(config.n_encoder_layers)), norm)
+        layers = (DecoderLayer(config) for _ in range(config.n_decoder_layers))
+        self.decoder = Stack(layers, nn.LayerNorm(dim))
         self.decoder_pos_embed = nn.Embedding(config.chunk_size, dim)
         self.action_head = nn.Linear(dim, ACTION_DIM)
         cells = map_size(config.features.image_height, config.features.image_width)
