@@ -150,16 +150,20 @@ def cosine_power(fraction: float) -> float:
 def _ddim_steps(schedule: NoiseSchedule, count: int) -> tuple[DdimStep, ...]:
     power, total = signal_power(schedule), schedule.num_train_timesteps
     timesteps = [total * (count - i) // count - 1 for i in range(count)]
-    after = [power[t] for t in timesteps[1:]] + [1.0]
+    return steps_at(timesteps, [math.sqrt(a) for a in power], [math.sqrt(1 - a) for a in power])
+
+
+def steps_at(
+    timesteps: Sequence[int], signal: Sequence[float], noise: Sequence[float]
+) -> tuple[DdimStep, ...]:
+    """Return the steps from each of these timesteps to the next, and from the last to x_0.
+
+    ``signal`` and ``noise`` are the coefficients of every training timestep.
+    """
+    after = [*((signal[t], noise[t]) for t in timesteps[1:]), (1.0, 0.0)]
     return tuple(
-        DdimStep(
-            timestep=t,
-            signal=math.sqrt(power[t]),
-            noise=math.sqrt(1 - power[t]),
-            next_signal=math.sqrt(next_power),
-            next_noise=math.sqrt(1 - next_power),
-        )
-        for t, next_power in zip(timesteps, after, strict=True)
+        DdimStep(timestep=t, signal=signal[t], noise=noise[t], next_signal=s, next_noise=n)
+        for t, (s, n) in zip(timesteps, after, strict=True)
     )
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from policy.adapters.lerobot.config import DiffusionConfig, map_size
 from policy.contract import ACTION_DIM
 from policy.errors import PolicyError
-from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise
+from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise, steps_at
 from policy.nets.resnet import LastMap
 from policy.nets.unet1d import GroupNorm, sinusoid_frequencies
 
@@ -221,17 +221,9 @@ class DdimSchedule:
                 f"num_diffusion_steps must be an integer in 1..{total}, the steps of its training; "
                 f"got {count!r}"
             )
-        spacing, signal, noise = total // count, self._signal, self._noise
-        return tuple(
-            DdimStep(
-                timestep=t,
-                signal=signal[t],
-                noise=noise[t],
-                next_signal=signal[t - spacing] if t >= spacing else 1.0,
-                next_noise=noise[t - spacing] if t >= spacing else 0.0,
-            )
-            for t in reversed(range(0, spacing * count, spacing))
-        )
+        spacing = total // count
+        timesteps = range(0, spacing * count, spacing)[::-1]
+        return steps_at(timesteps, self._signal, self._noise)
 
     def ddim_update(self, step: DdimStep, noisy: Chunk, output: Chunk) -> Chunk:
         """Take one reverse step with the net's output."""
