@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from types import MethodType, ModuleType
+from types import ModuleType
 
 from policy.adapters.description import Description
 from policy.adapters.interface import Interface
@@ -163,15 +163,6 @@ def _import_hint(where: Path | str, error: BaseException | None) -> str:
     return "mend that line"
 
 
-def _add_predict(policy: object, kind: type) -> None:
-    """Give the fast pair of a class, which may be frozen or have slots, a ``predict``."""
-    try:
-        object.__setattr__(policy, "predict", MethodType(predict_by_pair, policy))
-    except AttributeError:  # slots: an instance of a subclass has it
-        members = {"predict": predict_by_pair, "__module__": kind.__module__, "__slots__": ()}
-        object.__setattr__(policy, "__class__", type(kind.__name__, (kind,), members))
-
-
 def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
     arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
     try:
@@ -186,7 +177,8 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
         policy: object = found(**arguments)
         has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
         if has_pair and getattr(policy, "predict", None) is None:
-            _add_predict(policy, found)
+            found.predict = predict_by_pair  # type: ignore[attr-defined]
+            getattr(policy, "__dict__", {}).pop("predict", None)  # None of the instance hides it
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch
