@@ -5,7 +5,6 @@ The description is beside the graphs or inside an archive: docs/policy_exported.
 """
 
 import json
-import os
 import re
 import zipfile
 import zlib
@@ -48,7 +47,6 @@ _EXTERNAL = re.compile(
     r"(?:externally stored data in file \(|data_full_path: )(.+), offset: ", re.S
 )
 """In an error of OpenVINO: the file whose external weights are missing."""
-_MISMATCH = "size of the external data file does not match"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,18 +210,8 @@ def read_graph(path: Path) -> "ov.Model":
 
 def _lacking(path: Path, error: Exception) -> str | None:
     """Return what is wrong with a graph's external weights if that is why it was not read."""
-    if (found := _EXTERNAL.search(str(error))) is not None:
-        beside = path.parent / found[1]
-        what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
-        return f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"
-    if _MISMATCH not in str(error):
+    if (found := _EXTERNAL.search(str(error))) is None:
         return None
-    graph = path.read_bytes()
-    for beside in sorted(path.parent.iterdir()):
-        is_named = os.fsencode(beside.name) in graph
-        if is_named and beside.is_file() and (stands_in := stand_in(beside)) is not None:
-            return f"{beside}, beside {path.name}, is {stands_in[0]}: {stands_in[1]}"
-    return (
-        f"{path.parent}: the file with the weights of {path.name} is cut short, or of another "
-        f"export ({last_line(error)}): copy both files again"
-    )
+    beside = path.parent / found[1]
+    what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
+    return f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"

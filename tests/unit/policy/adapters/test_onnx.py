@@ -340,17 +340,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
         lambda folder: external_without_length(folder, Path.unlink),
         r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
-    "external data of no length cut": (
-        lambda folder: [
-            (folder / ".gitkeep").touch(),  # which the graph does not name
-            external_without_length(folder, lambda data: os.truncate(data, 100)),
-        ],
-        r"the weights of policy\.onnx is cut short, .*copy both",
-    ),
-    "external data of no length a pointer": (
-        lambda folder: external_without_length(folder, pointer),
-        r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
-    ),
     "output of no one size": (nonzero, r"has the shape \[2,\.\.13\], which depends on the values"),
     "integer actions": (
         lambda folder: graphs.actor(folder / "policy.onnx", action_type=TensorProto.INT64),
