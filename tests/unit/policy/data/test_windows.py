@@ -78,7 +78,7 @@ def test_states_are_those_of_the_exposures_and_follow_the_actions() -> None:
     ("every", "dt_s", "says"),
     [
         (1, 0.1, "steered 0: no 6 frames with states.*33 ms apart.: fly longer"),
-        (2, 0.1, "66 ms apart.: record 10 images a second, or 20 and more"),
+        (2, 0.1, "66 ms apart.: fly longer, or record 10 images a second, or 20 and more"),
         (1, 0.02, "record 50 images a second, or 100 and more"),
     ],
 )
