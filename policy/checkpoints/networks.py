@@ -16,6 +16,7 @@ import warnings
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.preprocess import image_to_input
 
+Config = TypeVar("Config", bound=BuiltinConfig | WorldModelConfig)
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
@@ -82,8 +84,7 @@ def save_checkpoint(
         policy.load_state_dict(unpack(state))
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
-    config = {name: value for name, value in asdict(policy.config).items() if name != "contract"}
-    architecture = json.dumps({"policy": policy.config.kind, **config}, sort_keys=True)
+    architecture = config_json(policy.config, policy=policy.config.kind)
     header = {CONTRACT_KEY: policy.contract.to_json(), ARCHITECTURE_KEY: architecture}
     if training is not None:
         header[TRAINING_KEY] = training
@@ -101,10 +102,7 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     if path.suffix == ".safetensors":
         header, tensors = read_tensors(path)
         require_header(path, header)
-        try:
-            config = _config_of(header, type(fallback))
-        except PolicyError as error:
-            raise CheckpointError(f"{path}: {error}") from error
+        config = _config_of(path, header, ARCHITECTURE_KEY, type(fallback))
         vector = {
             name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
             for name in list(tensors)
@@ -166,16 +164,27 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def _config_of(header: dict[str, str], wanted: type[BuiltinConfig]) -> BuiltinConfig:
-    contract, text = Contract.from_json(header[CONTRACT_KEY]), header[ARCHITECTURE_KEY]
-    data = parse_object(text, CheckpointError, "malformed architecture: it")
+def config_json(config: BuiltinConfig | WorldModelConfig, **more: str) -> str:
+    """Return the header form of a configuration: without the contract, which has its own entry."""
+    data = {name: value for name, value in asdict(config).items() if name != "contract"}
+    return json.dumps({**more, **data}, sort_keys=True)
+
+
+def _config_of(path: Path, header: dict[str, str], key: str, wanted: type[Config]) -> Config:
+    """Return the configuration under ``key`` of a file's header."""
+    text = header[key]
     try:
-        if (kind := data.pop("policy")) != wanted.kind:
-            raise CheckpointError(f"it holds a {kind}, no {wanted.kind}: fly it by --policy {kind}")
+        contract = Contract.from_json(header[CONTRACT_KEY])
+        data = parse_object(text, CheckpointError, f"malformed {key}: it")
+        kind, own = data.pop("policy", None), getattr(wanted, "kind", None)
+        if kind != own:
+            raise CheckpointError(f"it holds a {kind}, no {own}: fly it by --policy {kind}")
         return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
-    except (KeyError, TypeError) as error:
+    except PolicyError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    except (ArithmeticError, KeyError, TypeError) as error:
         raise CheckpointError(
-            f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
+            f"{path}: malformed {key} {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
 
 
@@ -219,7 +228,7 @@ def save_world_model(path: Path, model: WorldModel, *, training: str | None = No
     }
     require_finite(path, state)
     config = model.config
-    header = {WORLD_MODEL_KEY: config.to_json(), CONTRACT_KEY: config.contract.to_json()}
+    header = {WORLD_MODEL_KEY: config_json(config), CONTRACT_KEY: config.contract.to_json()}
     if training is not None:
         header[TRAINING_KEY] = training
     write_tensors(path, state, header)
@@ -232,11 +241,7 @@ def load_world_model(path: Path) -> WorldModel:
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
         held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
         raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
-    try:
-        contract = Contract.from_json(header[CONTRACT_KEY])
-        config = WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract)
-    except PolicyError as error:
-        raise CheckpointError(f"{path}: {error}") from error
+    config = _config_of(path, header, WORLD_MODEL_KEY, WorldModelConfig)
     return load_fitting(
         *(path, partial(WorldModel, config), state),
         "Train it again with this version of mavbridge",

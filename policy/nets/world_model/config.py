@@ -1,12 +1,10 @@
 """Dimensions of a world model, and its assumptions about the camera."""
 
-import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.files import parse_object
 from policy.nets.diffusion import NoiseSchedule
 
 FACTOR = 8
@@ -44,6 +42,7 @@ class WorldModelConfig:
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "autoencoder_widths", tuple(self.autoencoder_widths))  # a list
         if self.image_size < FACTOR or self.image_size % (FACTOR * self.patch):
             raise PolicyError(
                 f"image_size must be a multiple of {FACTOR * self.patch} ({FACTOR} pixels a "
@@ -57,19 +56,3 @@ class WorldModelConfig:
         """Channels, height and width of one frame's latents."""
         side = self.image_size // FACTOR
         return self.latent_channels, side, side
-
-    def to_json(self) -> str:
-        """Return the form stored in a checkpoint's header, without the contract."""
-        data = {name: value for name, value in asdict(self).items() if name != "contract"}
-        return json.dumps(data, sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str, contract: Contract) -> "WorldModelConfig":
-        """Read the header form."""
-        data = parse_object(text, PolicyError, "malformed world model: it")
-        try:
-            data["schedule"] = NoiseSchedule(**data["schedule"])
-            data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
-            return cls(contract=contract, **data)
-        except (PolicyError, ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error

@@ -8,7 +8,12 @@ import torch
 from safetensors.torch import save_file
 
 from helpers.training_runs import SMALL_WORLD
-from policy.checkpoints.networks import load_world_model, save_checkpoint, save_world_model
+from policy.checkpoints.networks import (
+    config_json,
+    load_world_model,
+    save_checkpoint,
+    save_world_model,
+)
 from policy.checkpoints.tensors import read_tensors
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
@@ -78,10 +83,10 @@ def test_what_cannot_be_written_is_told_and_leaves_the_file_before(model, tmp_pa
     ("header", "weights", "says"),
     [
         ({"world_model": "[" * 100_000}, {}, "malformed"),
-        ({"world_model": replace(CONFIG, frames=8).to_json()}, {}, "frame_position"),
-        ({"world_model": replace(CONFIG, autoencoder_widths=()).to_json()}, {}, "out of range"),
-        ({"world_model": replace(CONFIG, dynamics_width=10**6).to_json()}, {}, "few .*Train"),
-        ({"world_model": replace(CONFIG, dynamics_depth=10**9).to_json()}, {}, "few .*Train"),
+        ({"world_model": config_json(replace(CONFIG, frames=8))}, {}, "frame_position"),
+        ({"world_model": config_json(replace(CONFIG, autoencoder_widths=()))}, {}, "out of range"),
+        ({"world_model": config_json(replace(CONFIG, dynamics_width=10**6))}, {}, "few .*Train"),
+        ({"world_model": config_json(replace(CONFIG, dynamics_depth=10**9))}, {}, "few .*Train"),
         ({"contract": "{}x"}, {}, "not JSON"),
         ({}, {"action_std": torch.full((4,), float("inf"))}, "NaN or infinity.*action_std"),
         ({}, {"action_std": torch.ones(5)}, r"'action_std' is \[5\], must be \[4\]"),
