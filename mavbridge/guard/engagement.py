@@ -7,7 +7,12 @@ from dataclasses import replace
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, Memory, not_engaged
-from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
+from mavbridge.guard.sequences import (
+    MODE_SPACING_NS,
+    STICK_REST_NS,
+    DisengageSequence,
+    EngageSequence,
+)
 from mavbridge.guard.table import (
     PROGRESS,
     TABLE,
@@ -105,7 +110,11 @@ class Engagement(Memory):
                 return self.disengage.step(now, self.unheard_ns)
             case Phase.RELEASING:
                 self.owes_release = False
-                return Actions(control=ControlSource.RELEASE)
+                is_due = now.now_ns >= self.disengage.request_due_ns
+                mode = self.lost_mode(now) if is_due else None
+                if mode is not None:
+                    self.disengage.request_due_ns = now.now_ns + MODE_SPACING_NS
+                return Actions(control=ControlSource.RELEASE, mode=mode)
             case Phase.WAITING:
                 problem = now.link.problem or now.chunk_problem or switch_unseen(self, now)
                 self.reason = problem or because(Code.NOT_ENGAGED)

@@ -73,6 +73,8 @@ class Memory:
     until_ns: int = 0
     """Deadline of PREPARING."""
     released_ns: int = 0
+    released_mode: str | None = None
+    """Mode in which the sticks were released; None in a failsafe."""
     owes_release: bool = False
     """True until a release has been sent; one is sent even if no sticks seem to be held."""
     stepped_ns: int | None = None
@@ -98,6 +100,18 @@ class Memory:
         """True if the present mode is the late effect of a request of ours."""
         asked_ns = self.asked_ns.get(now.status.mode)
         return asked_ns is not None and now.now_ns - asked_ns <= LATE_NS
+
+    def lost_mode(self, now: EngagementInputs) -> str | None:
+        """Return the mode of the release if PX4 has fallen into a failsafe since, or None.
+
+        It reads a resting receiver every 0.3 s and misses our sticks after 0.6 s, so that it may
+        see neither for a moment. Its failsafe then ignores the pilot's sticks, and ends in RTL.
+        """
+        modes = now.link.modes
+        has_fallback = bool(modes.override) and not modes.is_silence_failsafe
+        is_dropped = now.status.is_failsafe and now.status.armed and now.status.mode == modes.hold
+        is_recent = now.now_ns - self.released_ns <= LATE_NS and not self.settings.is_setpoint
+        return self.released_mode if has_fallback and is_dropped and is_recent else None
 
     def nothing(self, _now: EngagementInputs, _cause: object) -> None:
         """nothing"""
@@ -178,7 +192,8 @@ class Memory:
         reason = cause.reason
         if self.phase in (Phase.LEAVING, Phase.HOLDING) and self.reason is not None:
             reason = because(Code.THEN, first=self.reason, then=reason)
-        self.reason, self.released_ns = reason, now.now_ns
+        self.reason = reason
+        self._note_release(now)
         self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
 
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
@@ -186,13 +201,17 @@ class Memory:
         mode = self.disengage.mode
         if mode is not None and mode != now.status.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
-        self.released_ns = now.now_ns
+        self._note_release(now)
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
         """nothing"""
         self.disengage.mode = None  # every later mode change comes from someone else
         if not now.link.is_released:
             self.refusal = because(Code.RELEASE_NOT_SEEN)
+
+    def _note_release(self, now: EngagementInputs) -> None:
+        self.released_ns = now.now_ns
+        self.released_mode = None if now.status.is_failsafe else now.status.mode
 
     def _note_end(self, cause: EndRequest) -> None:
         """Note how a flight has ended, and count it if a fault of ours ended it."""

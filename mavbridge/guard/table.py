@@ -196,8 +196,10 @@ def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
     4 s if it does not even show our last sticks; the outcome then says that the release was not
-    seen.
+    seen. For 1.5 s not while PX4 is in a failsafe since: its mode is requested again.
     """
+    if m.lost_mode(now) is not None:
+        return False
     timeout_ns = RELEASE_TIMEOUT_NS if now.link.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
     return (now.link.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
 
@@ -221,7 +223,8 @@ def over(m: Memory, _: EngagementInputs) -> bool:
 
 def entered_late(m: Memory, now: EngagementInputs) -> Reason | None:
     """the vehicle enters a mode of ours after all, within 1.5 s of the request"""
-    return because(Code.ENTERED_LATE, mode=now.status.mode) if m.has_asked(now) else None
+    is_late = m.has_asked(now) and now.status.mode != m.released_mode
+    return because(Code.ENTERED_LATE, mode=now.status.mode) if is_late else None
 
 
 # --- conditions

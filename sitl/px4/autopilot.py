@@ -16,6 +16,8 @@ from sitl.px4.sticks import RC_SOURCE, Px4Sticks
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.firmware import STOPPED
 
+RESTING_PERIOD_NS = 300 * NS_PER_S // 1000
+"""PX4 reads a receiver whose channels do not change only at this period (``rc_update``)."""
 RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground
 TAKEOFF_MARGIN_M = 0.2  # AUTO.TAKEOFF has arrived this far below its height
 
@@ -35,6 +37,8 @@ class Px4(Commander):
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
         self.flight = Px4Control(params)
+        self._read_us: tuple[int, ...] | None = None  # channels at the last reading
+        self._read_ns = boot_ns
         self._ramp_ns: int | None = None  # start of the takeoff ramp; None: no ramp
         self._flown_mode = self.mode
 
@@ -77,6 +81,9 @@ class Px4(Commander):
         """Feed the receiver's four mapped channels to the stick input as one more source."""
         if (frame_us := self.receiver.frame(self.now_ns)) is None:
             return
+        if frame_us == self._read_us and self.now_ns - self._read_ns <= RESTING_PERIOD_NS:
+            return
+        self._read_us, self._read_ns = tuple(frame_us), self.now_ns
         channels = [
             self.params.integer(f"RC_MAP_{axis}") for axis in ("PITCH", "ROLL", "THROTTLE", "YAW")
         ]

@@ -241,7 +241,28 @@ def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_th
     flight.vehicle.set_receiver((*sticks_us, 1000))
     flight.run(0.8)
     assert flight.px4.stick_input.source == RC_SOURCE, flight.describe()
-    assert not any(sample.failsafe for sample in flight.samples)
+    flight.run(1.2)
+    assert flight.px4.mode_name == mode, flight.describe()
+    assert not flight.samples[-1].failsafe
+
+
+@pytest.mark.parametrize("end", [OutputFlight.die, OutputFlight.stop])
+def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
+    end: Callable[[OutputFlight], None],
+) -> None:
+    """It reads a resting receiver every 0.3 s: after three ends of eight it saw no sticks."""
+    modes, failsafes = set(), 0
+    for wait_s in (0.0, 0.08, 0.16, 0.24):
+        flight = OutputFlight("px4", "sticks")
+        fall_back(flight, 1500, 1500, 1500, 1500)
+        flight.fly(1.2 + wait_s)
+        end(flight)
+        flight.run(2.0)
+        modes.add((flight.px4.mode_name, flight.px4.stick_input.source))
+        failsafes += any(sample.failsafe for sample in flight.samples)
+        assert flight.codes[-1] is not Code.ENTERED_LATE
+    assert modes == {("ALTCTL", RC_SOURCE)}
+    assert failsafes, "else nothing is shown"
 
 
 def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:
