@@ -134,9 +134,12 @@ class GuardProcess:
         if self.error is not None:
             raise self.error
         if self.summary is None and not stop.is_set():
-            left = self._speak()
-            signal = -(self._process.returncode or 0)
-            by = f" (signal {signal})" if signal > 0 else ""
+            left, code = self._speak(), self._process.returncode
+            if code is None and self.wait(REAP_S):
+                code = self._process.returncode
+            if code == 0:  # it waits 2 s for its summary to be read
+                raise GuardDiedError("the guard ended the flight while this process stood still")
+            by = f" (signal {-code})" if code is not None and code < 0 else ""
             raise GuardDiedError(f"the guard process has died{by}: {left}")
         if self.summary is not None and self.summary.failure is not None:
             raise PeerError(str(self.summary.failure))

@@ -210,3 +210,9 @@ def test_the_duplicate_is_closed_as_soon_as_nothing_is_held(rig: Rig) -> None:
     rig.die()
     assert link.heard() == [b""]  # the vehicle sees the end of the connection
     link.close()
+
+
+def test_a_guard_that_ended_in_order_unheard_is_not_called_dead(rig: Rig) -> None:
+    """Its summary does not fit into the channel of a process that was stopped for long."""
+    rig.tick(Phase.RELEASED)
+    assert rig.die(returncode=0) == "the guard ended the flight while this process stood still"
