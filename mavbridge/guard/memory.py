@@ -168,7 +168,7 @@ class Memory:
         """
         self._note_end(cause)
         self.reason = cause.reason
-        self.must_stop = cause != self.end_request
+        self.must_stop = self.must_stop and cause != self.end_request
         if cause.end == "takeover":
             self.seen_interruptions = now.link.interruptions
         self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal

@@ -109,7 +109,7 @@ def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
 
     The key `q`, a signal, a flight process that failed or died, the last gate of `--gates`.
     """
-    if m.end_request is None and m.act == "release":
+    if m.act == "release" and not m.must_stop:
         return EndRequest(because(Code.OPERATOR), end="operator")
     return m.end_request
 

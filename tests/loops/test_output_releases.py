@@ -10,9 +10,9 @@ import pytest
 
 from helpers.output_flights import COMBINATIONS, HOVERING, OutputFlight
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Action
-from mavbridge.guard.values import Phase
+from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -263,6 +263,17 @@ def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
         assert flight.codes[-1] is not Code.ENTERED_LATE
     assert modes == {("ALTCTL", RC_SOURCE)}
     assert failsafes, "else nothing is shown"
+
+
+def test_the_key_lands_a_vehicle_that_is_held_after_the_flight_process_failed() -> None:
+    flight = OutputFlight("px4", "sticks").fly(1.2)
+    flight.tell(EndRequest(because(Code.CAMERA_FAILED, camera=""), is_fault=True))
+    flight.run(2.0)
+    assert (flight.phase, flight.px4.mode_name) == (Phase.HOLDING, "AUTO.LOITER")
+    flight.act("release")
+    flight.run(2.0)
+    assert (flight.phase, flight.px4.mode_name) == (Phase.HOLDING, "AUTO.LAND")
+    assert flight.codes == (Code.OPERATOR,)
 
 
 def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:
