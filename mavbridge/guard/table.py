@@ -320,6 +320,8 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     changed = None
     if m.own_mode is not None and not _is_mode_ours(m, now):
         changed = because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
+        if now.status.is_landed and m.phase in (LEAVING, HOLDING):
+            changed = because(Code.LANDED)  # PX4 shows this change 4 ms before its disarming
     # The flag of a failsafe that kept our mode stays up, and does not tell who changes the mode.
     codes = m.reason.codes if m.phase in (LEAVING, HOLDING) and m.reason is not None else ()
     is_told = changed is not None and Code.FAILSAFE in codes

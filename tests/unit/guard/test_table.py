@@ -394,6 +394,8 @@ CASES = {
         why=Code.MODE_CHANGED),
     "failsafe's mode while holding": Case(holding, {**KEPT, "mode": "LAND"}, RELEASING, RELEASE,
         why=Code.FAILSAFE),
+    "landed while holding": Case(holding, {"mode": "ALT_HOLD", "is_landed": True}, RELEASING,
+        RELEASE, why=Code.LANDED),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
         why=Code.DISARMED),
     "held for long": Case(lambda: after(holding, 60.0), {}, HOLDING, NEUTRAL),
