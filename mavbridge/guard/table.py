@@ -196,7 +196,7 @@ def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
     4 s if it does not even show our last sticks; the outcome then says that the release was not
-    seen. For 1.5 s not while PX4 is in a failsafe since: its mode is requested again.
+    seen. A failsafe that PX4 has entered since is undone first, for 1.5 s.
     """
     if m.lost_mode(now) is not None:
         return False
