@@ -74,7 +74,7 @@ class Memory:
     """Deadline of PREPARING."""
     released_ns: int = 0
     released_mode: str | None = None
-    """Mode in which the sticks were released; None in a failsafe."""
+    """Mode of ours in which the sticks were released; None if somebody or a failsafe changed it."""
     owes_release: bool = False
     """True until a release has been sent; one is sent even if no sticks seem to be held."""
     stepped_ns: int | None = None
@@ -211,7 +211,8 @@ class Memory:
 
     def _note_release(self, now: EngagementInputs) -> None:
         self.released_ns = now.now_ns
-        self.released_mode = None if now.status.is_failsafe else now.status.mode
+        is_ours = now.status.mode == self.own_mode and not now.status.is_failsafe
+        self.released_mode = now.status.mode if is_ours else None
 
     def _note_end(self, cause: EndRequest) -> None:
         """Note how a flight has ended, and count it if a fault of ours ended it."""

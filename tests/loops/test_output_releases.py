@@ -265,6 +265,18 @@ def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
     assert failsafes, "else nothing is shown"
 
 
+def test_the_failsafe_of_a_dead_receiver_is_left_alone_after_a_takeover_to_hold() -> None:
+    """PX4 grants Hold without sticks: asked for by us again, it ended the failsafe, and no RTL."""
+    flight = OutputFlight("px4", "sticks")
+    fall_back(flight, 1500, 1500, 1500, 1500)
+    flight.fly(1.2)
+    flight.vehicle.set_receiver(())
+    flight.pilot_changes_mode()
+    flight.run(7.0)
+    assert flight.codes == (Code.MODE_CHANGED,)
+    assert flight.px4.mode_name == "AUTO.RTL", flight.describe()
+
+
 def test_the_key_lands_a_vehicle_that_is_held_after_the_flight_process_failed() -> None:
     flight = OutputFlight("px4", "sticks").fly(1.2)
     flight.tell(EndRequest(because(Code.CAMERA_FAILED, camera=""), is_fault=True))
