@@ -211,6 +211,8 @@ class VehicleStatus:
     """False if ``envelope.min_battery`` is set and no charge is reported to compare with it."""
     stick_override_ns: int | None = None
     """When it last reported that moving sticks have changed its mode."""
+    stick_loss_ns: int | None = None
+    """When it last reported that it gets no sticks any more."""
 
     @property
     def height_m(self) -> float | None:

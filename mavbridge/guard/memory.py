@@ -102,11 +102,13 @@ class Memory:
         return asked_ns is not None and now.now_ns - asked_ns <= LATE_NS
 
     def lost_mode(self, now: EngagementInputs) -> str | None:
-        """Return the mode of the release if PX4 has fallen into a failsafe since, or None.
+        """Return the mode of the release if PX4 has fallen into the failsafe of sticks since.
 
         It reads a resting receiver every 0.3 s and misses our sticks after 0.6 s, so that it may
         see neither for a moment. Its failsafe then ignores the pilot's sticks, and ends in RTL.
         """
+        if (now.status.stick_loss_ns or 0) <= self.released_ns:
+            return None  # a geofence, a battery
         modes = now.link.modes
         has_fallback = bool(modes.override) and not modes.is_silence_failsafe
         is_dropped = now.status.is_failsafe and now.status.armed and now.status.mode == modes.hold

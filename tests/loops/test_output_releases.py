@@ -265,6 +265,18 @@ def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
     assert failsafes, "else nothing is shown"
 
 
+def test_a_failsafe_that_is_not_of_the_sticks_is_left_alone_after_a_release() -> None:
+    """A geofence or a battery may bring it just then."""
+    flight = OutputFlight("px4", "sticks")
+    fall_back(flight, 1500, 1500, 1500, 1500)
+    flight.fly(1.2)
+    flight.act("release")
+    flight.run(0.3)
+    flight.px4.lost_sticks.start()  # ends in RTL, as they may
+    flight.run(1.5)
+    assert (flight.px4.mode_name, flight.codes) == ("AUTO.LOITER", (Code.OPERATOR,))
+
+
 def test_the_failsafe_of_a_dead_receiver_is_left_alone_after_a_takeover_to_hold() -> None:
     """PX4 grants Hold without sticks: asked for by us again, it ended the failsafe, and no RTL."""
     flight = OutputFlight("px4", "sticks")

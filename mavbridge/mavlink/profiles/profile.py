@@ -87,6 +87,7 @@ class EventMeaning(NamedTuple):
     is_failsafe: bool = False
     is_stick_override: bool = False
     """True if moving sticks have changed the mode."""
+    is_stick_loss: bool = False
     text: str | None = None
     """Text for the user, if no STATUSTEXT reports it."""
 

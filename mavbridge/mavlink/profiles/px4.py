@@ -125,7 +125,7 @@ _EVENTS = {
     "commander_failsafe_enter_generic_hold": EventMeaning(is_failsafe=True),
     "commander_failsafe_enter_autopilot_disengaged": EventMeaning(is_failsafe=True),
     "commander_rc_override": EventMeaning(is_stick_override=True),
-    "commander_rc_lost": EventMeaning(text="manual control lost"),
+    "commander_rc_lost": EventMeaning(is_stick_loss=True, text="manual control lost"),
     "commander_rc_regained": EventMeaning(text="manual control regained"),
 }
 

@@ -54,6 +54,7 @@ class VehicleCondition:
         self._changed_ns: int | None = None
         """Last change that CURRENT_MODE or an EVENT reported."""
         self._stick_override_ns: int | None = None
+        self._stick_loss_ns: int | None = None
         self._rc: tuple[int, RcChannels, RcCalibration | None] | None = None
         """Arrival and body of the newest RC_CHANNELS, and the calibration that it was read by."""
         self._rc_sticks: Sticks | None = None
@@ -125,6 +126,8 @@ class VehicleCondition:
             self._note_failsafe(arrived_ns)
         if meaning.is_stick_override:
             self._stick_override_ns = arrived_ns
+        if meaning.is_stick_loss:
+            self._stick_loss_ns = arrived_ns
 
     def _note_failsafe(self, arrived_ns: int) -> None:
         if not self._is_failsafe:
@@ -223,6 +226,7 @@ class VehicleCondition:
             battery_problem=self._battery_problem(now_ns),
             is_charge_known=self._is_charge_known(now_ns),
             stick_override_ns=self._stick_override_ns,
+            stick_loss_ns=self._stick_loss_ns,
         )
 
     def _is_position_valid(self, now_ns: int) -> bool | None:

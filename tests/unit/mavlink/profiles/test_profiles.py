@@ -243,7 +243,7 @@ def test_sticks_of_mavlink_must_be_taken_and_no_gesture_may_stop_the_motors(
         ("commander_disarmed_by", 0x1F46777, {"is_armed": False}),
         ("commander_failsafe_enter_hold", 0x1D11DF6, {"is_failsafe": True}),
         ("commander_failsafe_enter", 0x194CA8A, {}),
-        ("commander_rc_lost", 0x155CD44, {"text": "manual control lost"}),
+        ("commander_rc_lost", 0x155CD44, {"is_stick_loss": True}),
     ],
 )
 def test_numbers_of_events_are_those_that_the_firmware_sent(
