@@ -103,6 +103,15 @@ def holding(**settings: Any) -> Stepped:
     return stepped
 
 
+def held_by_px4(mode: str) -> Stepped:
+    """In this mode, after a fault without a receiver; ``on_fault`` has asked for it."""
+    facts = altered(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
+    stepped = flying(facts, on_fault="land" if mode == "AUTO.LAND" else "hold")
+    stepped.run(1.5, chunk_fault=NO_CHUNK)
+    stepped.run(1.5, mode=mode, chunk_fault=None)
+    return stepped
+
+
 def refused() -> Stepped:
     """BRAKE was asked for 10 ms ago and refused: now LAND is asked for."""
     stepped = flying(NO_RECEIVER)
@@ -394,8 +403,12 @@ CASES = {
         why=Code.MODE_CHANGED),
     "failsafe's mode while holding": Case(holding, {**KEPT, "mode": "LAND"}, RELEASING, RELEASE,
         why=Code.FAILSAFE),
-    "landed while holding": Case(holding, {"mode": "ALT_HOLD", "is_landed": True}, RELEASING,
-        RELEASE, why=Code.LANDED),
+    "landed while holding": Case(partial(held_by_px4, "AUTO.LAND"), {"mode": "ALTCTL",
+        "is_landed": True}, RELEASING, RELEASE, why=Code.LANDED),
+    "a hand after the landing, ArduPilot": Case(holding, {"mode": "LOITER", "is_landed": True},
+        RELEASING, RELEASE, why=Code.MODE_CHANGED),
+    "a hand on the ground, PX4": Case(partial(held_by_px4, "AUTO.LOITER"), {"mode": "ALTCTL",
+        "is_landed": True}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
         why=Code.DISARMED),
     "held for long": Case(lambda: after(holding, 60.0), {}, HOLDING, NEUTRAL),
