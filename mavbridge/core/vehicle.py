@@ -192,6 +192,8 @@ class VehicleStatus:
     rc_arrived_ns: int | None = None
     is_failsafe: bool = False
     """A failsafe is active: HEARTBEAT.system_status is critical or worse."""
+    is_mode_chosen: bool = False
+    """CURRENT_MODE reports that somebody has asked for the mode, not a failsafe."""
     is_landed: bool | None = None
     """None: the vehicle does not report it."""
     has_receiver: bool | None = None

@@ -265,6 +265,18 @@ def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
     assert failsafes, "else nothing is shown"
 
 
+def test_a_pilot_who_chooses_hold_in_that_failsafe_keeps_it() -> None:
+    flight = OutputFlight("px4", "sticks")
+    fall_back(flight, 1500, 1500, 1500, 1500)
+    flight.fly(1.28)
+    flight.act("release")
+    flight.until(lambda: flight.samples[-1].failsafe, within_s=1.2)
+    flight.run(0.03)
+    flight.pilot_changes_mode()
+    flight.run(2.0)
+    assert flight.px4.mode_name == "AUTO.LOITER", flight.describe()
+
+
 def test_a_failsafe_that_is_not_of_the_sticks_is_left_alone_after_a_release() -> None:
     """A geofence or a battery may bring it just then."""
     flight = OutputFlight("px4", "sticks")

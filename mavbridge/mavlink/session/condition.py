@@ -50,7 +50,7 @@ class VehicleCondition:
         self._mode_ns: int | None = None
         self._is_armed = False
         self._armed_ns: int | None = None
-        self._is_failsafe = False
+        self._is_failsafe = self._is_mode_chosen = False
         self._changed_ns: int | None = None
         """Last change that CURRENT_MODE or an EVENT reported."""
         self._stick_override_ns: int | None = None
@@ -112,6 +112,7 @@ class VehicleCondition:
         if body.custom_mode != self._custom_mode:
             self._custom_mode, self._changed_ns = body.custom_mode, arrived_ns
         intended = body.intended_custom_mode
+        self._is_mode_chosen = intended == body.custom_mode
         if self._is_armed and intended and intended != body.custom_mode:
             self._note_failsafe(arrived_ns)
 
@@ -217,6 +218,7 @@ class VehicleCondition:
             channels_arrived_ns=rc_ns,
             rc_arrived_ns=rc_ns,
             is_failsafe=self._is_failsafe,
+            is_mode_chosen=self._is_mode_chosen,
             is_landed=self._is_landed(now_ns),
             has_receiver=has_receiver,
             is_receiver_sick=self._system_bit(dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER) is False,
