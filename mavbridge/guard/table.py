@@ -196,7 +196,7 @@ def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
     4 s if it does not even show our last sticks; the outcome then says that the release was not
-    seen. A failsafe that PX4 has entered since is undone first, for 1.5 s.
+    seen. PX4's failsafe for lack of sticks is undone first, for 1.5 s.
     """
     if m.lost_mode(now) is not None:
         return False
