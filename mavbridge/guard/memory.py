@@ -107,7 +107,8 @@ class Memory:
         It reads a resting receiver every 0.3 s and misses our sticks after 0.6 s, so that it may
         see neither for a moment. Its failsafe then ignores the pilot's sticks, and ends in RTL.
         """
-        if (now.status.stick_loss_ns or 0) <= self.released_ns or now.status.is_mode_chosen:
+        is_chosen = now.status.is_mode_chosen and now.status.mode != self.released_mode
+        if (now.status.stick_loss_ns or 0) <= self.released_ns or is_chosen:
             return None  # a geofence, a battery, or a pilot who wants Hold
         modes = now.link.modes
         has_fallback = bool(modes.override) and not modes.is_silence_failsafe
