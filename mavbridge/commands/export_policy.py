@@ -9,9 +9,10 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from policy.adapters.export import export_onnx
 from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
-from policy.loading.builtin import BUILTIN_KINDS, load_builtin
+from policy.loading.builtin import load_builtin
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
+from policy.nets.names import BUILTIN_KINDS
 
 
 def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:

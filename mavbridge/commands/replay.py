@@ -323,8 +323,9 @@ def print_replay(result: ReplayResult, console: Console) -> None:
         moved = result.sticks.deviation
         rows.append(_row("sticks, these chunks and limits", "", moved))
         rows.append(_row("the same, rms", "", Deviation(largest=moved.rms, rms=moved.rms)))
-    title, header = f"replay of {result.source.folder} from {result.chosen}", "largest difference"
-    console.print(make_table(title, [header, "equal", *names], rows, left_columns=2))
+    title = f"replay of {result.source.folder} from {result.chosen}"
+    header = ["largest difference", "equal", *names]
+    console.print(make_table(title, header, rows, left_columns=2))
     recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
     console.print(recorded + (f", replayed on {result.engine}" if result.engine else ""))
     for gap in result.source.gaps:

@@ -12,6 +12,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from policy.contract import StateTime
+from policy.nets.names import BUILTIN_KINDS
 
 SIMULATOR = {"mujoco": "mujoco"}
 """Import and install name of what the simulator needs."""
@@ -31,7 +32,6 @@ MAX_EPISODES = 10_000
 """Most episodes per evaluation, so that different seeds never share courses."""
 _EXPERTS = ("seed", "image_size", "dual_rate")
 """Settings of a policy that a demonstration uses without a student, or checks itself."""
-_NETWORKS = ("toge", "toge-rates", "resnet-unet")
 
 MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
 """Beyond this seed, easy courses would be race courses, some of them trained on."""
@@ -164,7 +164,7 @@ class DemonstrateConfig(Ranged):
     @property
     def has_student(self) -> bool:
         """True if a policy flies; a built-in network needs ``checkpoint`` for that."""
-        return self.policy.checkpoint is not None or self.policy.kind not in _NETWORKS
+        return self.policy.checkpoint is not None or self.policy.kind not in BUILTIN_KINDS
 
     @property
     def first_course_seed(self) -> int:

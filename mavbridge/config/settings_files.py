@@ -15,8 +15,9 @@ from cyclopts.config import Dict
 from mavbridge.config.flight import split_camera
 from mavbridge.core.errors import UserError
 from policy.files import user_path
+from policy.nets.names import BUILTIN_KINDS
 
-_DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx")
+_DATA_KINDS = (*BUILTIN_KINDS, "scripted", "lerobot", "onnx")
 _ADDRESS_KEYS = ("rerun", "host", "ray")
 _OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
 _LOCAL = re.compile(

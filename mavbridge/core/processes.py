@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 
 import mavbridge
@@ -27,7 +28,8 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     On Linux an abstract socket with its number stays bound until this process ends, so that two
     processes that ask at the same time get two ports. Raises ``UserError`` if no port is free.
     """
-    for port in random.SystemRandom().sample(PORTS_TO_GIVE, k=len(PORTS_TO_GIVE)):
+    first = random.SystemRandom().randrange(len(PORTS_TO_GIVE))
+    for port in chain(PORTS_TO_GIVE[first:], PORTS_TO_GIVE[:first]):
         with (
             socket.socket(socket.AF_UNIX) as claim,
             socket.socket(socket.AF_INET, kind) as probe,

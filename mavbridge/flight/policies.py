@@ -11,9 +11,10 @@ from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from policy.contract import Contract
 from policy.files import user_path
-from policy.loading.builtin import BUILTIN_KINDS, shipped_weights
+from policy.loading.builtin import shipped_weights
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
+from policy.nets.names import BUILTIN_KINDS
 
 NO_IMAGE_ADVICE = "uses no image: give --camera none"
 STATELESS = (*BUILTIN_KINDS, "onnx")

@@ -305,7 +305,7 @@ def _failsafe(m: Memory, now: EngagementInputs, *, keeps_mode: bool) -> Reason |
 
 
 def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
-    is_preparing, roles = m.phase is Phase.PREPARING, now.link.modes
+    is_preparing = m.phase is Phase.PREPARING
     if now.link.interruptions != m.seen_interruptions:
         return now.link.interruption
     if now.link.is_overruled:
@@ -320,6 +320,7 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     changed = None
     if m.own_mode is not None and not _is_mode_ours(m, now):
         changed = because(Code.MODE_CHANGED, before=m.own_mode, after=now.status.mode)
+        roles = now.link.modes
         has_come_down = now.status.is_landed and m.own_mode in (roles.land, roles.rtl)
         if has_come_down and m.phase in (LEAVING, HOLDING) and roles.needs_setpoints_first:
             changed = because(Code.LANDED)  # PX4 shows this change 4 ms before its disarming

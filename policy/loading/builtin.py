@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from policy.adapters.user_class import FORMS
 from policy.errors import PolicyError, warned
 from policy.loading.request import PolicyRequest, default_contract
-from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
+from policy.nets.names import BACKBONE_NAMES, BUILTIN_KINDS, SIZE_NAMES, BackboneName, Size
 
 if TYPE_CHECKING:
     from policy.nets.toge import BuiltinConfig, BuiltinPolicy
@@ -15,7 +15,6 @@ SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Default weights of ``toge``; its model card is beside it."""
 SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
 """Default weights of ``toge-rates``, which flies by thrust and body rates."""
-BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":

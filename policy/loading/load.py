@@ -18,10 +18,11 @@ from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_device
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
-from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
+from policy.loading.builtin import builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract, measure_times
 from policy.motion.scripted import IN_AIR, ScriptedPolicy, make_scripted
 from policy.motion.stick_loop import by_rates, flown_by_rates
+from policy.nets.names import BUILTIN_KINDS
 from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep_nothing
 
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"

@@ -1,6 +1,8 @@
-"""User-visible names of sizes and image encoders; imports no torch."""
+"""User-visible names of built-in policies, sizes and image encoders; imports no torch."""
 
 from typing import Literal, get_args
+
+BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 Size = Literal["small", "medium", "large"]
 SIZE_NAMES: tuple[Size, ...] = get_args(Size)
