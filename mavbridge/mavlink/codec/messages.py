@@ -41,6 +41,8 @@ class Event(NamedTuple):
     """EVENT (410): one-time event; each firmware numbers its own."""
 
     event_id: int
+    sequence: int
+    """Number of the event on this link, modulo 65536."""
 
 
 class Attitude(NamedTuple):

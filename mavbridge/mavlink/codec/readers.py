@@ -170,7 +170,7 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
         m.alt / 1000, m.relative_alt / 1000, 1000 * m.time_boot_ms
     ),
     "CURRENT_MODE": lambda m: messages.CurrentMode(m.custom_mode, m.intended_custom_mode),
-    "EVENT": lambda m: messages.Event(m.id),
+    "EVENT": lambda m: messages.Event(m.id, m.sequence),
     "SYS_STATUS": _sys_status,
     "EXTENDED_SYS_STATE": lambda m: messages.LandedState(m.landed_state),
     "EKF_STATUS_REPORT": lambda m: messages.EstimatorFlags(m.flags),

@@ -174,6 +174,7 @@ class VehicleSession:
         self._upset: tuple[int, Reason] | None = None
         self._mode_sequence, self._mode_ns = 0, -SETTLE_NS
         """Sequence number and arrival of the last HEARTBEAT or CURRENT_MODE."""
+        self._event_sequence: int | None = None
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: request its echo, check its demands."""
@@ -190,6 +191,8 @@ class VehicleSession:
         self._streams.receive(message.name, arrived_ns)
         body = message.body
         if isinstance(body, Heartbeat | CurrentMode) and self._is_overtaken(message, arrived_ns):
+            return
+        if isinstance(body, Event) and self._is_old(body):
             return
         self.condition.receive(body, arrived_ns)
         match body:
@@ -219,6 +222,17 @@ class VehicleSession:
         if is_behind and arrived_ns - self._mode_ns < SETTLE_NS:
             return True
         self._mode_sequence, self._mode_ns = message.sequence, arrived_ns
+        return False
+
+    def _is_old(self, event: Event) -> bool:
+        """True for a late or doubled EVENT, and for one that another station has asked for again.
+
+        It would disarm an armed vehicle, or put it into a failsafe that is over.
+        """
+        before = self._event_sequence
+        if before is not None and not 0 < (event.sequence - before) % 65536 < 32768:
+            return True
+        self._event_sequence = event.sequence
         return False
 
     def _show(self, *texts: str) -> None:

@@ -93,7 +93,7 @@ ARMED = bytes.fromhex("fd0e00002404019a0100f3ca900134450000120000006604641c")
     ("data", "name", "crc_extra", "body"),
     [
         (IN_RTL, "CURRENT_MODE", 193, CurrentMode(5 << 24 | 4 << 16, 3 << 16)),
-        (ARMED, "EVENT", 160, Event(0x190CAF3)),
+        (ARMED, "EVENT", 160, Event(0x190CAF3, 18)),
     ],
 )
 @pytest.mark.parametrize("is_signed", [False, True])

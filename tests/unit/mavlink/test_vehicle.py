@@ -159,8 +159,8 @@ def battery(present: int, healthy: int, percent: int) -> SystemStatus:
 Told = tuple[tuple[str, ...], list[Body], dict[str, Any]]
 TOLD: list[Told] = [
     *((BOTH, [beat(2, state=k)], {"is_failsafe": k >= 5}) for k in range(9)),
-    (("ardupilot",), [Event(ARMED_BY)], {"armed": False}),
-    (("ardupilot",), [Event(FAILSAFE_HOLD)], {"is_failsafe": False}),
+    (("ardupilot",), [Event(ARMED_BY, 1)], {"armed": False}),
+    (("ardupilot",), [Event(FAILSAFE_HOLD, 1)], {"is_failsafe": False}),
     (BOTH, [], {"is_landed": None, "is_position_valid": None, "battery_problem": None}),
     *(
         (BOTH, told, {"is_charge_known": is_known})
@@ -250,12 +250,15 @@ def test_nothing_that_it_tells_holds_for_ever(body: Body, field: str, after_ms: 
             (10, beat(RTL), "AUTO.RTL armed"),
         ],
         [
-            (0, Event(ARMED_BY), "ALTCTL armed"),
+            (0, Event(ARMED_BY, 65535), "ALTCTL armed"),
             (50, beat(ALTCTL, armed=False), "ALTCTL armed"),
             (1000, beat(ALTCTL), "ALTCTL armed"),
-            (0, Event(FAILSAFE_HOLD), "ALTCTL armed failsafe"),
-            (0, Event(DISARMED_BY), "ALTCTL failsafe"),
+            (0, Event(FAILSAFE_HOLD, 0), "ALTCTL armed failsafe"),
+            (0, Event(DISARMED_BY, 1), "ALTCTL failsafe"),
+            (0, Event(ARMED_BY, 65535), "ALTCTL failsafe"),  # again, for another station
             (1000, beat(ALTCTL), "ALTCTL armed"),  # the event was another's, or it was armed again
+            (0, Event(DISARMED_BY, 1), "ALTCTL armed"),  # doubled
+            (0, Event(FAILSAFE_HOLD, 0), "ALTCTL armed"),
         ],
         [
             # Disarmed, it falls back to what could arm; armed, it has left the mode by itself.
@@ -311,8 +314,8 @@ def test_a_report_of_the_mode_that_was_overtaken_is_old(
     ("body", "tells_arming"),
     [
         (beat(ALTCTL), True),
-        (Event(ARMED_BY), True),
-        (Event(FAILSAFE_HOLD), False),
+        (Event(ARMED_BY, 1), True),
+        (Event(FAILSAFE_HOLD, 1), False),
         (CurrentMode(POSCTL, POSCTL), False),
     ],
 )
@@ -342,7 +345,7 @@ def test_sticks_need_a_px4_that_shows_the_throttle_as_it_was_sent(
 
 def test_px4s_events_without_a_text_are_shown() -> None:
     session = Session("px4")
-    session.put(Event(0x155CD44))
+    session.put(Event(0x155CD44, 1))
     assert session.texts[-1] == "vehicle: manual control lost"
 
 
