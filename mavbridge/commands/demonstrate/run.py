@@ -13,7 +13,7 @@ from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
 from mavbridge.config.episodes import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.provenance import digests
 from mavbridge.core.records import Event, Tick
@@ -62,17 +62,17 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
     longest_solve_ns = round(config.solve_time * NS_PER_MS)
     variation = draw_variation(spec.seed, longest_solve_ns=longest_solve_ns)
     with ExitStack() as stack:
-        contract, student = _terms(config, longest_solve_ns, stack)
         flight = SimulatedFlight(
             course_seed=spec.seed,
             seed=spec.seed,
             laps=ENDLESS_LAPS if config.courses == "loop" else 1,
             # The expert uses no image: frames are drawn in the size of the recording.
             settings=SimulationSettings(
-                delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
+                delays=variation.delays, least_camera_px=SIM_CAMERA_PX if config.has_student else 1
             ),
             vehicle=make_vehicle(autopilot=config.autopilot, conditions=variation.conditions),
         )
+        contract, student = _terms(config, longest_solve_ns, flight.clock, stack)
         pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
         meta = _meta(spec, variation, pilot.runner, flight.clock.now_ns())
         writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
@@ -92,7 +92,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 
 
 def _terms(
-    config: DemonstrateConfig, longest_solve_ns: int, stack: ExitStack
+    config: DemonstrateConfig, longest_solve_ns: int, clock: Clock, stack: ExitStack
 ) -> tuple[Contract, PolicyRunner | None]:
     """Return the contract of the flight and the student, if one flies; ``stack`` closes it."""
     wanted = config.policy
@@ -108,7 +108,7 @@ def _terms(
             stops_at_end=True,
         )
         return contract, None
-    loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
+    loaded = load_for_episodes(replace(wanted, dual_rate=True), clock)
     student = stack.enter_context(loaded).runner
     if student.contract.action != config.action:
         action = student.contract.action

@@ -186,6 +186,15 @@ def test_a_student_without_a_checkpoint_flies(tmp_path: Path) -> None:
     assert list(meta.policy_files) == [f"{tmp_path}/mine.py"]
 
 
+def test_a_scripted_student_lives_in_simulated_time(tmp_path: Path) -> None:
+    sent = []
+    for name in ("a", "b"):
+        circle = PolicyConfig(policy="scripted:circle:air")
+        assert demonstrate(replace(config(tmp_path / name, max_time=2.0), policy=circle)) == 0
+        sent.append(column(open_flight(tmp_path / name / "000000"), "sent"))
+    np.testing.assert_array_equal(*sent)
+
+
 def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> None:
     def flown(seed: int) -> list[bool]:
         turns = TurnSchedule(seed)
