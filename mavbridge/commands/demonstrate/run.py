@@ -243,6 +243,7 @@ def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
         "--action": (meta.contract and meta.contract.action, config.action),
         "--speed": (meta.plan.get("speed_mps"), config.speed),
         "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
+        "--policy": (meta.policy, config.policy.policy if config.has_student else meta.policy),
         "--checkpoint": tuple(
             " ".join(sorted(digest[:8] for digest in files.values())) or "none"
             for files in (meta.policy_files, spec.weights)

@@ -129,6 +129,21 @@ def test_a_flight_of_other_settings_is_neither_counted_nor_overwritten(
     assert (tmp_path / "000000/camera.mp4").is_file()
 
 
+def test_no_other_student_goes_on_where_no_files_tell_two_apart(
+    flight: RecordedFlight, tmp_path: Path
+) -> None:
+    meta = replace(flight.meta, source="dagger", policy="scripted:circle:air")
+    (tmp_path / "000000").mkdir()
+    write_meta(tmp_path / "000000", meta)
+    wanted = [
+        replace(config(tmp_path), policy=PolicyConfig(policy=f"scripted:{name}:air", seed=3))
+        for name in ("circle", "square")
+    ]
+    assert demonstrate(wanted[0]) == 0
+    with pytest.raises(UserError, match="--policy scripted:circle:air, not scripted:square:air"):
+        demonstrate(wanted[1])
+
+
 def test_an_interrupted_demonstration_is_unfinished(tmp_path: Path) -> None:
     spec = DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=config(tmp_path))
     answers = chain(repeat(False, 2_000), repeat(True))  # 5 s of vehicle steps
