@@ -265,7 +265,9 @@ def _losses(flight: RecordedFlight) -> int:
     counts = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
     if any(count is not None for count in counts):
         return sum(count or 0 for count in counts)
-    tables = (flight.ticks, flight.frames)
+    others = () if meta.contract is None else meta.contract.cameras[1:]
+    frames = [open_flight(flight.folder, name).frames for name in others]
+    tables = (flight.ticks, flight.frames, *frames)
     return sum(sum(table.column("dropped_before").to_pylist()) for table in tables)
 
 

@@ -226,11 +226,12 @@ def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: 
     assert "cut off" in text
 
 
-def test_all_cameras_are_told_and_shown(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_all_cameras_are_told_and_shown(tmp_path: Path, is_whole: bool) -> None:
     contract = Contract(cameras=("front", "down"))
     events = [make_frame(number, camera=1) for number in (0, 1, 3, 4)] + flown(20)
     meta = make_meta(contract=contract)
-    folder = write(tmp_path / "flight", events, frames=6, meta=meta)
+    folder = write(tmp_path / "flight", events, frames=6, meta=meta, finish=is_whole)
     flight = analyse(folder)
     assert [(each.camera, len(each.exposed_s)) for each in flight.cameras] == [
         ("front", 6),
