@@ -194,10 +194,10 @@ class MavlinkLink:
         """Process one message of the chosen vehicle."""
         body, happened_ns = message.body, arrived_ns
         if isinstance(body, LocalVelocity) and not vehicle.condition.is_velocity_usable(arrived_ns):
-            self._counters.receive(f"{message.name} (invalid)", message.sequence, arrived_ns)
+            self._counters.receive(f"{message.name} (invalid)", message, arrived_ns)
             vehicle.receive(message, arrived_ns)
             return
-        self._counters.receive(message.name, message.sequence, arrived_ns)
+        self._counters.receive(message.name, message, arrived_ns)
         if isinstance(body, Measurement):
             happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
             self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)

@@ -10,6 +10,7 @@ from mavbridge.mavlink.codec.messages import (
     Attitude,
     LocalVelocity,
     Measurement,
+    ReceivedMessage,
     StampOrder,
 )
 from mavbridge.mavlink.codec.packets import Codec
@@ -94,32 +95,34 @@ class LinkCounters:
     def __init__(self) -> None:
         self._by_name: Counter[str] = Counter()
         self._last_sequence: int | None = None
-        self._recent: deque[int] = deque(maxlen=_MOST_OVERTAKEN)
+        self._recent: deque[bytes] = deque(maxlen=_MOST_OVERTAKEN)
         self._lost = 0
         self._first_ns: int | None = None
         self.heard_ns = 0
         """Arrival of the newest message; 0 before the first."""
         self.sent = 0
 
-    def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
+    def receive(self, name: str, message: ReceivedMessage, arrived_ns: int) -> None:
         """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256).
 
-        An overtaken message fills the gap that it left; a doubled one counts once.
+        An overtaken message fills the gap that it left; a doubled one counts once. Some routers do
+        not number the messages.
         """
+        if message.packet not in self._recent:
+            self._recent.append(message.packet)
+            self._by_name[name] += 1
+            self._count_gap(message.sequence)
+        self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
+        self.heard_ns = arrived_ns
+
+    def _count_gap(self, sequence: int) -> None:
         last = self._last_sequence
         ahead = 1 if last is None else (sequence - last) % 256
-        if sequence in self._recent:
-            ahead = 0
-        elif ahead >= 256 - _MOST_OVERTAKEN:
+        if ahead >= 256 - _MOST_OVERTAKEN:
             self._lost = max(self._lost - 1, 0)
         elif ahead > 0:
             self._lost += ahead - 1
             self._last_sequence = sequence
-        if ahead > 0:
-            self._by_name[name] += 1
-            self._recent.append(sequence)
-        self._first_ns = arrived_ns if self._first_ns is None else self._first_ns
-        self.heard_ns = arrived_ns
 
     def new_sequence(self) -> None:
         """Accept any sequence number next: the sender has restarted."""

@@ -20,6 +20,7 @@ from mavbridge.mavlink.codec.messages import (
     Endpoint,
     Heartbeat,
     LocalVelocity,
+    ReceivedMessage,
     SpecificForce,
     Timesync,
 )
@@ -502,6 +503,10 @@ def test_the_newest_reading_by_the_vehicles_clock_is_held(
     assert velocities(*received) == held
 
 
+def numbered(sequence: int, packet: bytes) -> ReceivedMessage:
+    return ReceivedMessage(Endpoint(1, 1), sequence, "ATTITUDE", None, packet)
+
+
 @pytest.mark.parametrize(
     ("sequences", "lost"),
     [
@@ -522,6 +527,15 @@ def test_gaps_in_the_sequence_are_losses(sequences: tuple[int | None, ...], lost
         if sequence is None:
             counters.new_sequence()
         else:
-            counters.receive("ATTITUDE", sequence, k * S)
+            counters.receive("ATTITUDE", numbered(sequence, b"%d" % sequence), k * S)
     assert counters.lost_fraction == pytest.approx(lost / (lost + received))
     assert counters.messages_per_s == (("ATTITUDE", received / (len(sequences) - 1)),)
+
+
+def test_messages_of_a_router_that_does_not_number_count_and_their_copies_do_not() -> None:
+    counters = LinkCounters()
+    for k in range(11):
+        for _ in range(2):
+            counters.receive("ATTITUDE", numbered(0, b"%d" % k), k * S // 10)
+    assert counters.messages_per_s == (("ATTITUDE", 11.0),)
+    assert counters.lost_fraction == 0.0
