@@ -50,6 +50,11 @@ _NOT_REPLACED = (errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS)
 """Errors on replacing a file that may be writable all the same."""
 
 
+_NO_FOLDER = (errno.EACCES, errno.EINVAL)
+"""Errors of a folder that cannot be read, or on a file system that writes no folders to the disk
+(those that virtual machines share)."""
+
+
 def write_output(path: Path, text: str, flag: str) -> None:
     """Write the file that a flag names, durably where it can be replaced.
 
@@ -97,8 +102,12 @@ def write_durably(path: Path, text: str) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        if error.errno not in _NO_FOLDER:
+            raise

@@ -1,0 +1,32 @@
+"""Durable writes of files."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from mavbridge.core.files import write_durably
+
+
+@pytest.mark.parametrize("fault", [errno.EINVAL, errno.EIO])
+def test_a_file_system_that_writes_no_folders_to_the_disk_will_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: int
+) -> None:
+    """So do those of virtual machines' shared folders; a fault of the disk is told."""
+    real = os.fsync
+
+    def fsync(fd: int) -> None:
+        if stat.S_ISDIR(os.fstat(fd).st_mode):
+            raise OSError(fault, os.strerror(fault))
+        real(fd)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    if fault == errno.EIO:
+        with pytest.raises(OSError, match=os.strerror(fault)):
+            write_durably(tmp_path / "meta.json", "{}")
+    else:
+        write_durably(tmp_path / "meta.json", "{}")
+    assert [path.name for path in tmp_path.iterdir()] == ["meta.json"]
+    assert (tmp_path / "meta.json").read_text() == "{}"
