@@ -33,8 +33,6 @@ from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_document
-from mavbridge.observe.viewer.flight import RerunView
-from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.folder import remove_flight
 from policy.protocol import PolicyRunner
 
@@ -109,6 +107,9 @@ class FlightObservers:
         """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
         if self._config.rerun == "off":
             return
+        from mavbridge.observe.viewer.flight import RerunView  # takes 0.4 s
+        from mavbridge.observe.viewer.layout import ViewedFlight
+
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
             vision_hz=self._plan.image_rates_hz[0],

@@ -9,23 +9,63 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from pathlib import Path
 from textwrap import wrap
+from uuid import uuid4
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint
 from mavbridge.observe.viewer.plots import ActionPlots, Columns, TimingPlots
 from mavbridge.observe.viewer.scene import PlanView, SceneView
-from mavbridge.observe.viewer.target import RerunRecording
+from mavbridge.observe.viewer.target import prepare_target
 
 EVENT_CHARACTERS = 64
 """Longer texts continue in the next line; the viewer cuts them off at the edge of its panel."""
 
 BATCHES_OF_ROWS = 3
 """Plots, the scene and the images advance in steps of this many batches."""
+
+
+class RerunRecording:
+    """One recording and its target. Every call can block while a viewer does not keep up."""
+
+    def __init__(self, application: str, target: str) -> None:
+        """Check the target, and start the viewer if it is to be spawned.
+
+        Args:
+            application: the viewer's name for the content.
+            target: that of ``prepare_target``.
+
+        Raises:
+            MavbridgeError: as in ``prepare_target``.
+        """
+        prepared = prepare_target(target)
+        self._file = prepared if isinstance(prepared, Path) else None
+        self._sink = rr.FileSink(self._file) if self._file else rr.GrpcSink(str(prepared))
+        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
+        self.stream = rr.RecordingStream(application, recording_id=uuid4())
+
+    def open(self, blueprint: rrb.Blueprint) -> None:
+        """Open the file or the connection, with this initial layout of the viewer."""
+        self.stream.set_sinks(self._sink, default_blueprint=blueprint)
+
+    def close(self) -> None:
+        """Deliver the rest and close; raise MavbridgeError if the viewer is gone, or the disk is
+        full."""
+        try:
+            self.stream.flush()
+            self.stream.disconnect()
+        except RuntimeError as error:
+            if self._file is not None:
+                told = f"{self._file} is not complete ({error}): make room on its disk"
+                raise MavbridgeError(told) from error
+            raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
 
 
 class RerunView:

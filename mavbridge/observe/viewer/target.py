@@ -1,4 +1,4 @@
-"""A Rerun recording and its target (``--rerun``), which is ready before the flight begins."""
+"""The target of a Rerun recording (``--rerun``), which is ready before the flight begins."""
 
 import socket
 import subprocess
@@ -6,10 +6,6 @@ import sys
 import tempfile
 from pathlib import Path
 from urllib.parse import urlsplit
-from uuid import uuid4
-
-import rerun as rr
-import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
@@ -26,42 +22,6 @@ SETTLE_S = 1.0
 """A viewer without a display opens its port first and exits immediately afterwards."""
 _POLL_S = 0.1
 _SCHEMES = ("rerun", "rerun+http", "rerun+https")
-
-
-class RerunRecording:
-    """One recording and its target. Every call can block while a viewer does not keep up."""
-
-    def __init__(self, application: str, target: str) -> None:
-        """Check the target, and start the viewer if it is to be spawned.
-
-        Args:
-            application: the viewer's name for the content.
-            target: that of ``prepare_target``.
-
-        Raises:
-            MavbridgeError: as in ``prepare_target``.
-        """
-        prepared = prepare_target(target)
-        self._file = prepared if isinstance(prepared, Path) else None
-        self._sink = rr.FileSink(self._file) if self._file else rr.GrpcSink(str(prepared))
-        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
-        self.stream = rr.RecordingStream(application, recording_id=uuid4())
-
-    def open(self, blueprint: rrb.Blueprint) -> None:
-        """Open the file or the connection, with this initial layout of the viewer."""
-        self.stream.set_sinks(self._sink, default_blueprint=blueprint)
-
-    def close(self) -> None:
-        """Deliver the rest and close; raise MavbridgeError if the viewer is gone, or the disk is
-        full."""
-        try:
-            self.stream.flush()
-            self.stream.disconnect()
-        except RuntimeError as error:
-            if self._file is not None:
-                told = f"{self._file} is not complete ({error}): make room on its disk"
-                raise MavbridgeError(told) from error
-            raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
 
 
 def prepare_target(text: str) -> Path | str:

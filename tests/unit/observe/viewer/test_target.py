@@ -9,12 +9,8 @@ import pytest
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.observe.viewer import target
-from mavbridge.observe.viewer.target import (
-    RerunRecording,
-    check_target,
-    prepare_target,
-    spawn_viewer,
-)
+from mavbridge.observe.viewer.flight import RerunRecording
+from mavbridge.observe.viewer.target import check_target, prepare_target, spawn_viewer
 
 LISTENS_UNTIL_KILLED = """
 import socket, sys
