@@ -105,7 +105,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         settings=settings,
         vehicle=make_vehicle(autopilot=config.autopilot, gains=config.gains, conditions=conditions),
     )
-    with load_for_episodes(config.policy, flight.clock) as loaded:
+    with load_for_episodes(config.policy, flight.clock, spec.seed) as loaded:
         contract = contract_with_ages(loaded.runner.contract, config.limits)
         if config.solve_time is not None:
             longest_s = contract.horizon * contract.chunk_dt_s

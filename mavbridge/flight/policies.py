@@ -1,8 +1,11 @@
 """Load the policy that the flags name."""
 
+import random
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from mavbridge.camera.open import NO_CAMERA, require_present
 from mavbridge.config.flight import FlyConfig
@@ -128,8 +131,24 @@ def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
     return load_configured_policy(policy, MonotonicClock())
 
 
-def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """Load a policy for one of many flights. Stateless policies are loaded once per process."""
+def load_for_episodes(policy: PolicyConfig, clock: Clock, seed: int) -> LoadedPolicy:
+    """Load a policy for one of many flights. Stateless policies are loaded once per process.
+
+    Others may draw random numbers of the whole process, which start at ``seed``: a flight depends
+    on no flight before it.
+    """
     if is_stateless(policy):
         return _loaded_once(policy)
-    return load_configured_policy(policy, clock)
+    _seed_globals(policy, seed)
+    loaded = load_configured_policy(policy, clock)
+    _seed_globals(policy, seed)  # only the first import of a user's file runs code of its own
+    return loaded
+
+
+def _seed_globals(policy: PolicyConfig, seed: int) -> None:
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - the generator that a user's code may draw from
+    if not is_scripted(policy):
+        import torch
+
+        torch.manual_seed(seed)

@@ -72,7 +72,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
             ),
             vehicle=make_vehicle(autopilot=config.autopilot, conditions=variation.conditions),
         )
-        contract, student = _terms(config, longest_solve_ns, flight.clock, stack)
+        contract, student = _terms(spec, longest_solve_ns, flight.clock, stack)
         pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
         meta = _meta(spec, variation, pilot.runner, flight.clock.now_ns())
         writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
@@ -92,10 +92,10 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 
 
 def _terms(
-    config: DemonstrateConfig, longest_solve_ns: int, clock: Clock, stack: ExitStack
+    spec: DemonstrationSpec, longest_solve_ns: int, clock: Clock, stack: ExitStack
 ) -> tuple[Contract, PolicyRunner | None]:
     """Return the contract of the flight and the student, if one flies; ``stack`` closes it."""
-    wanted = config.policy
+    config, wanted = spec.config, spec.config.policy
     if not config.has_student:
         size_px = wanted.image_size or SIM_CAMERA_PX
         contract = Contract(
@@ -108,7 +108,7 @@ def _terms(
             stops_at_end=True,
         )
         return contract, None
-    loaded = load_for_episodes(replace(wanted, dual_rate=True), clock)
+    loaded = load_for_episodes(replace(wanted, dual_rate=True), clock, spec.seed)
     student = stack.enter_context(loaded).runner
     if student.contract.action != config.action:
         action = student.contract.action

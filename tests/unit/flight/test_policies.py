@@ -1,6 +1,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mavbridge.config.flight import CameraConfig, FlyConfig
@@ -10,11 +11,13 @@ from mavbridge.core.errors import CameraError, UserError
 from mavbridge.flight.policies import (
     check_configured_policy,
     load_configured_policy,
+    load_for_episodes,
     looks_at_images,
     policy_files,
     require_cameras,
     require_images,
 )
+from policy.engines.runner import dummy_sample, encode_all
 
 MINE = """
 import numpy as np
@@ -27,6 +30,39 @@ class Still:
     def predict(self, image, state, action_history, num_diffusion_steps):
         return np.zeros((1, self.contract.horizon, 4), np.float32)
 """
+
+DRAWING = """
+import numpy as np
+import torch
+from policy.contract import Contract
+
+
+class Drawing:
+    contract = Contract()
+
+    def __init__(self):
+        self.bias = float(np.random.rand())
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        return torch.rand(1, self.contract.horizon, 4) * self.bias
+"""
+
+
+def test_random_numbers_of_a_policy_depend_on_the_episode_and_on_none_before_it(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "drawing.py"
+    path.write_text(DRAWING)
+    wanted = PolicyConfig(policy=f"{path}:Drawing")
+
+    def first_chunk(seed: int) -> np.ndarray:
+        runner = load_for_episodes(wanted, MonotonicClock(), seed).runner
+        images, state, history = dummy_sample(runner.contract)
+        return runner.act(encode_all(runner, images), state, history)
+
+    alone = first_chunk(7)
+    assert not np.array_equal(first_chunk(8), alone)
+    np.testing.assert_array_equal(first_chunk(7), alone)
 
 
 def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
