@@ -28,8 +28,8 @@ from benchmarks.link_vehicle import LinkLatency
 from mavbridge.commands.output import table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable
+from policy.errors import require_packages
 
 TIMED: tuple[PolicyConfig, ...] = tuple(
     PolicyConfig(policy=policy, allow_untrained=is_untrained, engine=engine)
@@ -63,7 +63,7 @@ def main(*, json: Path | None = None, check: Path | None = None) -> int:
     """
     budget = None if check is None else read_budget(check)
     require_writable(json, "--json")
-    require_packages("make bench, which flies the simulator,", {"mujoco": "mujoco"})
+    require_packages("make bench, which flies the simulator,", "mujoco")
     console = table_console()
     result = measure()
     console.print(engine_table(result.engines))

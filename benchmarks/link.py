@@ -19,7 +19,7 @@ from mavbridge.commands.output import make_table, print_status, table_console
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, running, wait
 from mavbridge.core.vehicle import Percentiles
-from mavbridge.observe.report_table import number
+from mavbridge.observe.terminal import number
 
 LINK_VEHICLE = "benchmarks.link_vehicle"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"

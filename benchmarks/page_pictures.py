@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from mavbridge.commands.inspect.analysis import analyse
 from mavbridge.commands.inspect.page import write_page
-from mavbridge.observe.viewer.layout import timing_page
+from mavbridge.observe.viewer_layout import timing_page
 
 SIZE_PX, PAGE_PX = (1500, 900), "1000,1500"
 TIMEOUT_S = 120.0

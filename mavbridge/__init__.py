@@ -26,4 +26,8 @@ if sys.argv[:1] == ["-m"] and not sys.flags.safe_path:  # so while Python looks 
     left_out = [entry for entry in sys.path[:1] if entry != _root]
     sys.path[: len(left_out)] = []
 
+SAFE_PATH, OUR_SAFE_PATH = "PYTHONSAFEPATH", "mavbridge"
+"""Variable that keeps the working directory off Python's search path, and our value of it. Programs
+of the user do not inherit ours."""
+
 __version__ = "0.1.0"

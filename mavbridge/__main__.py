@@ -1,13 +1,20 @@
 """Entry point: expected errors are one message and their status; anything else is our bug."""
 
+import importlib.util
 import io
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 
-from mavbridge.core.own_packages import OUR_SAFE_PATH, SAFE_PATH, hidden_package
+import mavbridge
+from mavbridge import OUR_SAFE_PATH, SAFE_PATH
+
+PACKAGES = ("policy", "sitl")
+"""Packages beside ``mavbridge`` whose names a user's module may have."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,6 +51,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         console = SafeConsole(stderr=True, highlight=False, emoji=False)
         end(error.exit_code, partial(console.print, message, soft_wrap=True))
     end(status or 0)
+
+
+def hidden_package() -> str | None:
+    """Return an error message if a user's module hides one of ``PACKAGES``, else None.
+
+    Imports nothing. Python searches the working directory first (``python -m``), then PYTHONPATH.
+    """
+    for name in PACKAGES:
+        if (spec := _found(name)) is None:
+            return f"mavbridge's own package {name} is missing: install mavbridge again"
+        places = [spec.origin, *(spec.submodule_search_locations or ())]
+        found = next(place for place in places if place is not None)
+        if Path(found).resolve() != (Path(__file__).parents[1] / name / "__init__.py").resolve():
+            return (
+                f"{found} hides mavbridge's own package {name}: run `mavbridge`, not `python -m "
+                "mavbridge`, and take that folder off PYTHONPATH; or rename it. As a policy it "
+                f"flies by its path: --policy ./{name}.py:Class"
+            )
+    return None
+
+
+def _found(name: str) -> ModuleSpec | None:
+    """Return what ``import`` would find with the working directory on the search path."""
+    path, sys.path = sys.path, [*mavbridge.left_out, *sys.path]
+    try:
+        return importlib.util.find_spec(name)
+    finally:
+        sys.path = path
 
 
 if __name__ == "__main__":

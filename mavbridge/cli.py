@@ -23,7 +23,7 @@ from mavbridge.commands.config import (
     ReplayConfig,
     ServeConfig,
 )
-from mavbridge.config.episodes import SIMULATOR, DemonstrateConfig, EvaluateConfig
+from mavbridge.config.episodes import DemonstrateConfig, EvaluateConfig
 from mavbridge.config.flags import RARE
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import (
@@ -33,12 +33,12 @@ from mavbridge.config.settings_files import (
     with_settings,
 )
 from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
 from mavbridge.core.log import run_log
 from mavbridge.core.provenance import printable
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
-from policy.adapters.websocket.kind import require_packages as require_websocket
+from policy.adapters.websocket.kind import PACKAGES as REMOTE_PACKAGES
+from policy.errors import require_packages
 from policy.files import read_toml
 from policy.training.settings import TrainSettings, WorldModelSettings
 
@@ -186,7 +186,7 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
 @cli.command(group=CONVERTING)
 def serve(config: ServeConfig | None = None) -> int:
     """Serve a policy to other computers, for --policy ws://HOST:PORT."""
-    require_websocket("serve")
+    require_packages("serve", *REMOTE_PACKAGES)
     from mavbridge.commands.serve import serve as run_server
 
     return run_server(ServeConfig() if config is None else config)
@@ -204,7 +204,7 @@ def imagine(config: ImagineConfig) -> int:
 @cli.command(group=LEARNING)
 def evaluate(config: EvaluateConfig | None = None) -> int:
     """Fly a policy over many simulated courses, and count the gates."""
-    require_packages("evaluate", SIMULATOR)
+    require_packages("evaluate", "mujoco")
     from mavbridge.commands.evaluate import evaluate as run_evaluation
 
     return run_evaluation(EvaluateConfig() if config is None else config)
@@ -214,7 +214,7 @@ def evaluate(config: EvaluateConfig | None = None) -> int:
 def demonstrate(config: DemonstrateConfig) -> int:
     """Record an expert's flights of simulated courses to learn from."""
     require_extra("demonstrate")
-    require_packages("demonstrate", SIMULATOR)
+    require_packages("demonstrate", "mujoco")
     from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
 
     return run_demonstrations(config)
@@ -285,7 +285,7 @@ def export(*flights: Path, config: ExportConfig) -> int:
     if not flights:
         raise UserError("name the flights to export: mavbridge export DIR... --out DIR")
     if config.format == "mcap":
-        require_packages("export --format mcap", {"mcap": "mcap"})
+        require_packages("export --format mcap", "mcap")
         from mavbridge.commands.export.mcap_file import export as run_export
     else:
         from mavbridge.commands.export.run import export as run_export

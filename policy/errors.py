@@ -4,6 +4,7 @@
 ``mavbridge``.
 """
 
+import importlib.util
 import sysconfig
 import threading
 import traceback
@@ -14,6 +15,8 @@ from pathlib import Path
 _OURS = Path(__file__).parent
 _LIBRARIES = {Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")}
 _WARNING = "warning: "
+_INSTALL_NAMES = {"Xlib": "python-xlib"}
+"""Names of packages that differ from that of their module."""
 
 
 class MavbridgeError(Exception):
@@ -41,6 +44,14 @@ class NoChunkError(PolicyError):
     The flight continues along the last chunk while its limits permit. The user sees the message as
     the reason.
     """
+
+
+def require_packages(what: str, *modules: str) -> None:
+    """Raise MavbridgeError if ``what`` needs a module that is not installed."""
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        names = " ".join(_INSTALL_NAMES.get(name, name) for name in missing)
+        raise MavbridgeError(f"{what} needs {' and '.join(missing)}: pip install {names}")
 
 
 class Warned(str):

@@ -17,13 +17,13 @@ from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
-from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import CameraImage, Frame
+from policy.errors import require_packages
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
-SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
+SCREEN_PACKAGES = ("mss", "Xlib")
 """Packages of the extra "screen": import name to pip name."""
 NO_CAMERA = "none"
 BLANK_NS = NS_PER_S // 30
@@ -57,7 +57,7 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     elif kind == "jpeg-udp":
         parse_jpeg_udp(rest)
     elif kind == "screen":
-        require_packages("--camera screen:", SCREEN_PACKAGES)
+        require_packages("--camera screen:", *SCREEN_PACKAGES)
     elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or stat.S_ISREG(mode)):
         if stat.S_ISFIFO(mode):
             raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")

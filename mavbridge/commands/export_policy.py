@@ -6,9 +6,9 @@ from pathlib import Path
 from mavbridge.commands.config import ExportPolicyConfig
 from mavbridge.commands.output import text_console
 from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
 from policy.adapters.export import export_onnx
 from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
+from policy.errors import require_packages
 from policy.loading.builtin import load_builtin
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
@@ -22,7 +22,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     if kind not in BUILTIN_KINDS:
         raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
     ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
-    require_packages("export-policy", {"onnx": "onnx"})
+    require_packages("export-policy", "onnx")
     if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
         raise UserError(f"--out {config.out} is taken: name a new or empty folder")
     policy, notes = load_builtin(ours)

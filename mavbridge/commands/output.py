@@ -16,10 +16,10 @@ from rich.progress import (
 from rich.table import Table
 
 from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
 from mavbridge.core.files import as_json, require_writable, write_output
 from mavbridge.core.provenance import without_secrets
 from mavbridge.observe.output import SafeConsole
+from policy.errors import require_packages
 
 PIPED_WIDTH = 120
 """Columns of the tables if there is no terminal."""
@@ -57,7 +57,7 @@ def require_outputs(json_file: Path | None, plot: Path | None) -> None:
     require_writable(json_file, "--json")
     require_writable(plot, "--plot")
     if plot is not None:
-        require_packages("--plot", {"matplotlib": "matplotlib"})
+        require_packages("--plot", "matplotlib")
 
 
 def write_json(path: Path | None, document: object) -> None:

@@ -33,7 +33,7 @@ from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, is_stateless, load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of
-from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.flight_folder import open_cameras, open_flight
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PAST_INPUTS,
@@ -104,8 +104,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     if wanted.limits != source.config.limits or not is_same:
         traces = stick_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
-        names = source.contract.cameras
-        damage = [text for name in names for text in open_flight(folder, name).damage]
+        damage = [text for camera in open_cameras(folder) for text in camera.damage]
         source = replace(source, gaps=tuple(dict.fromkeys((*source.gaps, *damage))))
     result = ReplayResult(
         source=source,

@@ -14,8 +14,6 @@ from mavbridge.core.errors import UserError
 from policy.contract import StateTime
 from policy.nets.names import BUILTIN_KINDS
 
-SIMULATOR = {"mujoco": "mujoco"}
-"""Import and install name of what the simulator needs."""
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race", "loop"]
 """Families of courses, each with its own seeds and the same ranges of them."""

@@ -11,8 +11,8 @@ from itertools import chain
 from pathlib import Path
 
 import mavbridge
+from mavbridge import OUR_SAFE_PATH, SAFE_PATH
 from mavbridge.core.errors import UserError
-from mavbridge.core.own_packages import OUR_SAFE_PATH, SAFE_PATH
 
 IMPORT_ROOT = Path(mavbridge.__file__).parents[1]
 """Folder that holds this mavbridge: the source tree, or site-packages."""

@@ -10,7 +10,7 @@ from mavbridge.core.address import is_reachable, parse_address
 from mavbridge.core.course import read_gates
 from mavbridge.core.files import require_writable
 from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
-from mavbridge.observe.viewer.target import check_target
+from mavbridge.observe.viewer_target import check_target
 from mavbridge.recording.folder import prepare_folder
 
 

@@ -37,7 +37,7 @@ from mavbridge.recording.folder import remove_flight
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
-    from mavbridge.recording.meta import FlightMeta
+    from mavbridge.recording.folder import FlightMeta
     from mavbridge.recording.recorder import Recorder
 
 RERUN_CAPACITY = 1000
@@ -107,8 +107,8 @@ class FlightObservers:
         """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
         if self._config.rerun == "off":
             return
-        from mavbridge.observe.viewer.flight import RerunView  # takes 0.4 s
-        from mavbridge.observe.viewer.layout import ViewedFlight
+        from mavbridge.observe.viewer import RerunView  # takes 0.4 s
+        from mavbridge.observe.viewer_layout import ViewedFlight
 
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
@@ -137,7 +137,7 @@ class FlightObservers:
         """
         if self._config.record is None or guard.tlog_pipe is None:
             return
-        from mavbridge.recording.meta import FlightMeta
+        from mavbridge.recording.folder import FlightMeta
         from mavbridge.recording.recorder import Recorder
         from mavbridge.recording.settings import ReplaySettings
 
@@ -187,7 +187,7 @@ class FlightObservers:
 
     def _write_end(self, meta: "FlightMeta", folder: Path) -> None:
         """Add the outcome and the vehicle's parameters to ``meta.json``."""
-        from mavbridge.recording.meta import write_meta
+        from mavbridge.recording.folder import write_meta
 
         try:
             write_meta(folder, meta)

@@ -4,9 +4,11 @@ import logging
 import threading
 from collections import deque
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import NamedTuple
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 from mavbridge.config.rates import STATUS_HZ
@@ -14,10 +16,10 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.log import SAID, is_log_thread
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import Event, Tick
+from mavbridge.core.vehicle import LinkStats
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
 from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_shown
-from mavbridge.observe.report_table import number, rate_style, timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
 
 _said = logging.getLogger(SAID)
@@ -25,6 +27,13 @@ RATE_WINDOW_S = 1.0
 ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
 """Interval between lines if the output is not a terminal."""
+RELEASES_SHOWN = 3
+GOOD, POOR, BAD = "green", "yellow", "red"
+_LEGEND = (
+    "stick lateness: from a slot of the stick grid to its send; a slot is missed when nothing was "
+    "sent within one period. New attitude to wire: from the measurement of a new attitude to "
+    "the first send of sticks based on it."
+)
 
 
 class RateMeter:
@@ -157,8 +166,8 @@ class FlightScreen:
         if (table := timing_table(report)) is not None:
             self._messages.put(table, soft_wrap=False)
         for verdict in verdicts(report):
-            _said.info("%s", verdict.plain if isinstance(verdict, Text) else verdict)
-            self._messages.put(verdict, soft_wrap=not self._console.is_terminal)
+            _said.info("%s", verdict.line.plain)
+            self._messages.put(verdict.line, soft_wrap=not self._console.is_terminal)
 
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
@@ -222,3 +231,114 @@ class FlightScreen:
 def _age(now_ns: int, stamp_ns: int | None) -> str:
     age_ms = None if stamp_ns is None else (now_ns - stamp_ns) / NS_PER_MS
     return f"{number(age_ms, 0)} ms"
+
+
+def timing_table(report: TimingReport) -> Table | None:
+    """Return the measured percentiles of a flight in milliseconds; None if nothing was measured."""
+    rows = report.times_ms
+    if not any(rows.values()):
+        return None
+    table = Table(
+        title=f"{report.duration_s:.1f} s, {report.mode} rate: {report.policy} on {report.engine}, "
+        f"{report.autopilot or 'no vehicle'}",
+        title_justify="left",
+        title_style="bold",
+        caption=_LEGEND,
+        caption_justify="left",
+    )
+    table.add_column("ms")
+    for name in ("p50", "p99", "p99.9", "max"):
+        table.add_column(name, justify="right")
+    for label, measured in rows.items():
+        if measured is not None:
+            values = (measured.p50, measured.p99, measured.p999, measured.max)
+            table.add_row(label, *(f"{v:.2f}" if v < 1000 else f"{v:.0f}" for v in values))
+    return table
+
+
+class Verdict(NamedTuple):
+    """Result of one part of a flight."""
+
+    name: str
+    text: str
+    style: str = ""
+    """``GOOD``, ``POOR`` or ``BAD``; empty: neither."""
+
+    @property
+    def line(self) -> Text:
+        """Return the line of the terminal."""
+        return Text.assemble((f"{self.name:9}", "bold"), (self.text, self.style))
+
+
+def verdicts(report: TimingReport) -> list[Verdict]:
+    """Return a verdict on each part of a flight, with its target and its result."""
+    sticks, action, vision = report.sticks, report.action, report.vision
+    missed = f"{_counted(sticks.missed_slots, 'slot')} of {sticks.slots} missed"
+    style = GOOD if not sticks.missed_slots else POOR
+    coasting = f"{_counted(sticks.coasting_sends, 'send')} coasting"
+    text = f"{sticks.target_hz:g} Hz grid, {missed}, {coasting}"
+    lines = [Verdict("sticks", text, style if sticks.slots else BAD)]
+    late = f"{_counted(action.late_chunks, 'late chunk')} of {action.chunks}"
+    dropped = "frames dropped by the camera not measured"
+    if vision.dropped_frames is not None:
+        dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
+    for name, loop, rest in (("action", action, late), ("vision", vision, dropped)):
+        text = f"{number(loop.rate_hz, 1)} Hz of {loop.target_hz:.4g} Hz, {rest}"
+        lines.append(Verdict(name, text, rate_style(loop.rate_hz, loop.target_hz)))
+    if report.link is not None:
+        lines.append(Verdict("link", _link_verdict(report.link)))
+    lines.append(Verdict("releases", _release_verdict(report)))
+    drops = {"rerun": report.observer_drops.rerun, "recorder": report.observer_drops.recorder}
+    lines += [
+        Verdict(name, f"missed {_counted(count, 'event')}", POOR)
+        for name, count in drops.items()
+        if count
+    ]
+    return lines
+
+
+def _link_verdict(link: LinkStats) -> str:
+    echo = {True: "echo confirmed", False: "NO ECHO from the vehicle", None: "echo not checked"}
+    lost = (
+        "loss not measured"
+        if link.lost_fraction is None
+        else f"{shown_share(link.lost_fraction, 2)} of the vehicle's messages lost"
+    )
+    sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
+    limits = "".join(
+        f", {stick} beyond what the vehicle does in {shown_share(share, 1)}"
+        for stick, share in link.saturated
+    )
+    return f"{sent}, {echo[link.echo_confirmed]}, {lost}{limits}"
+
+
+def _release_verdict(report: TimingReport) -> str:
+    if not report.releases:
+        return "never released"
+    last = report.releases[-RELEASES_SHOWN:]
+    shown = "; ".join(f"{release.reason} ({release.t_s:.1f} s)" for release in last)
+    more = "last " if report.release_count > len(last) else ""
+    return f"released {_counted(report.release_count, 'time')}, {more}for: {shown}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def number(value: float | None, digits: int) -> str:
+    """Format a figure; a dash if it was not measured."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def shown_share(share: float, digits: int) -> str:
+    """Format a fraction as per cent; a small one, which would read as zero, by its bound."""
+    least = 10.0 ** -(2 + digits)
+    bound = f"under {least:.{digits}%}"
+    return bound if 0 < share < least / 2 else f"{share:.{digits}%}"
+
+
+def rate_style(rate_hz: float | None, target_hz: float) -> str:
+    """Return the colour of a rate: green from 99 % of its target, yellow from 90 %."""
+    if rate_hz is None or rate_hz < 0.9 * target_hz:
+        return BAD
+    return GOOD if rate_hz >= 0.99 * target_hz else POOR

@@ -109,6 +109,20 @@ class TimingReport:
     release_count: int
     observer_drops: ObserverDrops
 
+    @property
+    def times_ms(self) -> dict[str, Percentiles | None]:
+        """Measured times by name."""
+        return {
+            "stick lateness": self.sticks.lateness_ms,
+            "chunk period": self.action.period_ms,
+            "predict": self.action.predict_ms,
+            "vision encode": self.vision.encode_ms,
+            "feature age at send": self.feature_age_ms,
+            "attitude age at send": self.state_age_ms,
+            "new attitude to wire": self.state_to_wire_ms,
+            "link round trip": self.link.rtt_ms if self.link else None,
+        }
+
 
 class FlightTiming:
     """``TickSink`` that measures the timing of a flight.

@@ -9,11 +9,18 @@ import numpy as np
 
 from mavbridge.core.records import CameraImage, ImageArray
 from mavbridge.recording import rows
-from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
-from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
+from mavbridge.recording.folder import (
+    TICKS,
+    VIDEO,
+    FlightError,
+    FlightMeta,
+    frames_of,
+    read_meta,
+    video_of,
+)
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import count_lost, read_numbered, read_table, table_exists
-from mavbridge.recording.video.file import read_video
+from mavbridge.recording.video_file import read_video
 from policy.data.flight_video import with_images
 from policy.files import why_unreadable
 
@@ -82,6 +89,13 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
         numbers=numbers,
         damage=tuple(damage),
     )
+
+
+def open_cameras(folder: Path) -> list[RecordedFlight]:
+    """Call ``open_flight`` for each camera of a flight, in the contract's order."""
+    first = open_flight(folder)
+    others = () if first.meta.contract is None else first.meta.contract.cameras[1:]
+    return [first, *(open_flight(folder, name) for name in others)]
 
 
 def _frames(

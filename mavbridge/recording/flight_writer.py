@@ -15,16 +15,17 @@ from mavbridge.recording.folder import (
     SOLVES,
     TICKS,
     TLOG,
+    FlightMeta,
     features_of,
     frames_of,
     video_of,
+    write_meta,
 )
-from mavbridge.recording.meta import FlightMeta, write_meta
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogPipe
-from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError, WriterError
-from mavbridge.recording.video.writer_process import VideoJob
+from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError, WriterError
 
 PACKET_CAPACITY = 60_000
 """Capacity of the queue of packet stamps: one minute of the busiest link."""

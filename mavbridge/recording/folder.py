@@ -1,11 +1,22 @@
-"""Names in a flight's folder, and the check that it can be written. Imports no extra."""
+"""A flight's folder: the names of its files, the check that it can be written, and ``meta.json``:
+facts about the flight, its policy and its contract. Imports no extra.
+"""
 
+import json
+import math
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any, Literal, get_args
 
-from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.files import as_json, write_durably
+from mavbridge.core.reasons import reason_from_json
+from mavbridge.core.records import FlightOutcome
+from policy.contract import Contract
+from policy.errors import ContractError, require_packages
+from policy.files import read_json
 
 META = "meta.json"
 TICKS = "ticks"
@@ -17,7 +28,10 @@ SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
 """Stems of the tables for a replay."""
 SETTINGS = "settings.json"
 EXTRA = ("av", "pyarrow")
-"""Packages of the ``record`` extra; each has the same name for import and installation."""
+"""Packages of the ``record`` extra."""
+FORMAT = "mavbridge-flight"
+VERSION = 1
+FlightSource = Literal["flight", "demonstration", "dagger", "imagined", "pilot"]
 
 
 def video_of(camera: str | None) -> str:
@@ -37,7 +51,7 @@ def features_of(camera: str | None) -> str:
 
 def require_extra(what: str) -> None:
     """Raise UserError if the extra is not installed. ``what`` is the feature that needs it."""
-    require_packages(what, {name: name for name in EXTRA})
+    require_packages(what, *EXTRA)
 
 
 def prepare_folder(folder: Path, flag: str) -> None:
@@ -74,3 +88,159 @@ def remove_flight(folder: Path, cameras: Sequence[str]) -> None:
     for name in (META, SETTINGS, TLOG, *map(video_of, names), *tables):
         with suppress(OSError):
             (folder / name).unlink(missing_ok=True)
+
+
+class FlightError(MavbridgeError):
+    """A recorded flight cannot be read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightMeta:
+    """Facts about a whole flight; None: unknown, or not known yet."""
+
+    started_at: str
+    """ISO 8601, UTC."""
+    start_ns: int
+    """Start of the flight on the clock of all stamps."""
+    mavbridge_version: str
+    source: FlightSource
+    policy: str | None
+    engine: str | None
+    mode: Literal["dual", "single"]
+    autopilot: str | None = None
+    action_hz: float
+    visual_hz: float
+    image_height: int | None = None
+    """Height of the recorded frames. The four sizes are written at the end."""
+    image_width: int | None = None
+    source_height: int | None = None
+    """Height of the incoming frames. An odd last row is cut off, which H.264 cannot have."""
+    source_width: int | None = None
+    contract: Contract | None
+    course_seed: int | None = None
+    seed: int | None = None
+    finished: bool = False
+    """True if the recording was closed in order."""
+    ticks: int | None = None
+    frames: int | None = None
+    """Number of rows in the tables of ticks and of frames; known at the end."""
+    ticks_dropped: int | None = None
+    frames_dropped: int | None = None
+    packets_dropped: int | None = None
+    """Each ``*_dropped`` counts the losses before the last row of its files, of all cameras."""
+    success: bool | None = None
+    """True if the flight is an example to follow: by the pilot's mark, else by course and outcome.
+    False after a crash or a fault."""
+    crash: str | None = None
+    """How the vehicle crashed, in words."""
+    gates_passed: int | None = None
+    outcome: FlightOutcome | None = None
+    """How the policy's flight ended; None if no policy flew, and in older flights."""
+    conditions: dict[str, float] = field(default_factory=dict)
+    """Randomised physical quantities, by name."""
+    command: tuple[str, ...] = ()
+    """Command line, one word per item, without passwords."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Versions of mavbridge, Python, the system and relevant packages, by name."""
+    git_revision: str | None = None
+    """Commit of the checkout that ran, with ``-dirty`` if files differed from it."""
+    policy_files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the policy's files (weights, contract, code), by absolute path."""
+    cameras: dict[str, str] = field(default_factory=dict)
+    """Source of each camera, by its name in the contract."""
+    plan: dict[str, float] = field(default_factory=dict)
+    """Rates, periods and limits of the flight, as resolved from flags and contract."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Flight-relevant parameters read from the autopilot, by name."""
+
+    @property
+    def loss(self) -> str | None:
+        """Missing part of the recording, in words; None if it was closed in order."""
+        if self.finished:
+            return None
+        if self.ticks is None:
+            return "cut off: shown up to its last whole batch of rows"
+        return "images lost: the process that writes the video died; all else is whole"
+
+    @property
+    def keeps_neutral(self) -> bool:
+        """True if neutral is due in each pass of the way out; setpoints to PX4 end before it
+        does."""
+        is_stick_flight = self.contract is None or self.contract.action == "sticks"
+        return is_stick_flight or (self.autopilot or "").startswith("ardupilot")
+
+    def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
+        """Add the outcome; derive ``success`` from it if it is not set yet."""
+        success = outcome.success if self.success is None else self.success
+        return replace(self, outcome=outcome, success=success)
+
+
+def write_meta(folder: Path, meta: FlightMeta) -> None:
+    """Write or replace ``meta.json``; raise OSError if that fails."""
+    document = {"format": FORMAT, "version": VERSION} | asdict(meta)
+    if meta.outcome is not None:
+        document["outcome"] = meta.outcome.to_json()
+    write_durably(folder / META, as_json(document))
+
+
+def read_meta(folder: Path) -> FlightMeta:
+    """Read ``meta.json``; raise FlightError if it is missing or not ours."""
+    try:
+        if odd := [each.name for each in folder.iterdir() if not (each.is_file() or each.is_dir())]:
+            raise FlightError(f"{folder / odd[0]} is neither a file nor a folder: leave it out")
+        document: Any = read_json(folder / META)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FlightError(_unreadable(folder)) from error
+    except OSError as error:
+        raise FlightError(f"{error.filename} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise FlightError(f"{folder / META} is not JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise FlightError(f"{folder / META} is not of a recorded flight: no format {FORMAT!r}")
+    if document.get("version") != VERSION:
+        raise FlightError(
+            f"{folder} has version {document.get('version')} of the format, this build reads "
+            f"{VERSION}: use the mavbridge that recorded it"
+        )
+    return _meta(folder, document)
+
+
+def _unreadable(folder: Path) -> str:
+    if not folder.exists():
+        return f"there is no folder {folder}: name one that mavbridge --record made"
+    if not folder.is_dir():
+        return f"{folder} is a file: a recorded flight is a folder, made by mavbridge --record"
+    inside = sorted(entry.name for entry in folder.iterdir())
+    if not inside:
+        return f"{folder} is empty: nothing was recorded there"
+    if flights := sorted(folder.glob(f"*/{META}")):
+        return f"{folder} holds flights, and is none: name one of them ({flights[0].parent})"
+    return (
+        f"{folder} is no recorded flight: it has no {META} (it has {', '.join(inside[:3])}); "
+        "mavbridge --record makes one"
+    )
+
+
+def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
+    """Read the document. Keys of later versions are ignored; keys of this version must be present
+    and valid."""
+    known = {f.name: document[f.name] for f in fields(FlightMeta) if f.name in document}
+    try:
+        if known.get("contract") is not None:
+            known["contract"] = Contract.from_json(json.dumps(known["contract"]))
+        if known.get("outcome") is not None:
+            reason = known["outcome"]["reason"]
+            # A sentence without a code is not read back, because no decision can be based on it.
+            reason = reason_from_json(reason) if isinstance(reason, dict) else None
+            known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
+        known["command"] = tuple(known.get("command", ()))
+        meta = FlightMeta(**known)
+    except (KeyError, TypeError, ValueError, ContractError) as error:
+        raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
+    if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
+        raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
+    for name in ("start_ns", "action_hz", "visual_hz"):
+        value = getattr(meta, name)
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            raise FlightError(f"{folder / META}: {name} is {value!r}, not a number")
+    return meta

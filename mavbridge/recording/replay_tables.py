@@ -51,13 +51,6 @@ PACKETS = pa.schema(
 )
 
 
-class SolveRow(NamedTuple):
-    """One solve, and the number of unrecorded solves before it."""
-
-    solve: Solve
-    dropped_before: int
-
-
 class PacketStamp(NamedTuple):
     """Arrival of one packet of ``link.tlog``, and the time that its contents describe."""
 
@@ -106,7 +99,7 @@ def packet_columns(packet: ForwardedPacket, dropped_before: int) -> Row:
     }
 
 
-def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
+def read_solves(table: pa.Table, contract: Contract) -> Iterator[Solve]:
     """Return the records of a table of solves, with read-only arrays in the contract's shapes."""
     shapes = {
         "states": (1, *contract.state_shape),
@@ -120,13 +113,12 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
             extras_ns=row["extras_ns"],
             **{name: row[name] for name in STATE_STAMPS},
         )
-        solve = Solve(
+        yield Solve(
             state=state,
             frame_ids=tuple(map(tuple, row["frame_ids"])),
             **{name: row[name] for name in _SOLVE},
             **{name: row[name].reshape(shapes[name]) for name in _ARRAYS},
         )
-        yield SolveRow(solve, row["dropped_before"])
 
 
 def read_features(table: pa.Table) -> Iterator[FeatureFrame]:

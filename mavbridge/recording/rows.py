@@ -14,7 +14,7 @@ import pyarrow as pa
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.folder import FlightError
 from mavbridge.recording.tables import Row, table_rows
 from policy.contract import ACTION_DIM, STATE_DIM
 

@@ -7,8 +7,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.provenance import without_secrets
-from mavbridge.recording.folder import SETTINGS
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.folder import SETTINGS, FlightError
 from policy.files import read_json
 
 _T = TypeVar("_T")

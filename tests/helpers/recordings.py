@@ -15,9 +15,9 @@ from helpers.factories import START_NS, make_vision_tick
 from mavbridge.core.records import ImageArray, Tick, VisionTick
 from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video.writer_process import FrameFiles, VideoJob
+from mavbridge.recording.video_process import FrameFiles, VideoJob
 from policy.contract import Contract
 from policy.data.flight_video import video_parts
 

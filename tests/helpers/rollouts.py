@@ -27,7 +27,7 @@ from mavbridge.commands.imagine.output import SCHEMA, StreamedOutput
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
-from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 from policy.nets.world_model.config import WorldModelConfig

@@ -23,7 +23,7 @@ from mavbridge.camera.shared_memory import HEADER, MAGIC, SharedMemoryCamera
 from mavbridge.commands.inspect.analysis import analyse
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.meta import read_meta
+from mavbridge.recording.folder import read_meta
 from mavbridge.recording.rows import TICKS
 from mavbridge.recording.tables import read_table
 from mavbridge.simulation.replay.recording import open_source

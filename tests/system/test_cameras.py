@@ -25,7 +25,7 @@ from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.folder import FlightError
 from sitl.camera.shm import FramePublisher
 
 pytestmark = pytest.mark.system

@@ -29,7 +29,7 @@ from mavbridge.flight.guard_process import start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import patient_console
-from mavbridge.observe.report_table import number
+from mavbridge.observe.terminal import number
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner

@@ -32,7 +32,7 @@ from mavbridge.mavlink.session.vehicle import HEARTBEAT_TIMEOUT_NS, VehicleSessi
 from mavbridge.mavlink.transport.connection import Transport
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
-from mavbridge.observe.report_table import shown_share
+from mavbridge.observe.terminal import shown_share
 from policy.contract import Contract
 
 SET_UP_S = 15.0

@@ -20,8 +20,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_for_episodes, policy_files
 from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.folder import META, prepare_folder
-from mavbridge.recording.meta import FlightMeta, read_meta
+from mavbridge.recording.folder import META, FlightMeta, prepare_folder, read_meta
 from mavbridge.recording.rows import FrameTruth
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import Exposure, make_vehicle

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from mavbridge.core.records import ImageArray
-from mavbridge.recording.video.file import VideoError
+from mavbridge.recording.video_file import VideoError
 from policy.adapters.interface import state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names

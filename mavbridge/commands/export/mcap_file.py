@@ -24,9 +24,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind, Sticks
 from mavbridge.observe.images import as_rgb, jpeg
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.recording.folder import META
-from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
+from mavbridge.recording.folder import META, FlightMeta
 from mavbridge.recording.rows import TickRow
 from policy.contract import QUATERNION, STATE_NAMES, Contract, StateFrame
 from policy.data.flight_folders import find_flights
@@ -90,19 +89,12 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
     above, count = Path(os.path.commonpath([folder.parent for folder in folders])), 0
     with whole_or_nothing(config.out) as out:
         for folder in folders:
-            cameras, name = _cameras(folder), "-".join(folder.relative_to(above).parts)
+            cameras, name = open_cameras(folder), "-".join(folder.relative_to(above).parts)
             print_warnings(console, dict.fromkeys(chain(*(each.damage for each in cameras))))
             count += write_flight(cameras, out / f"{name}.mcap")
     text = f"{config.out}: {len(folders)} flights, {count} messages"
     text_console().print(text, soft_wrap=True)
     return 0
-
-
-def _cameras(folder: Path) -> list[RecordedFlight]:
-    """Open a flight with each of its cameras, in the contract's order."""
-    first = open_flight(folder)
-    names = () if first.meta.contract is None else first.meta.contract.cameras[1:]
-    return [first, *(open_flight(folder, name) for name in names)]
 
 
 def write_flight(cameras: Sequence[RecordedFlight], path: Path) -> int:

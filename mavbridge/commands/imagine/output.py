@@ -30,9 +30,9 @@ from mavbridge.core.records import ImageArray
 from mavbridge.core.workers import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video.file import WRITE_ERRORS
-from mavbridge.recording.video.writer import VideoWriter
-from mavbridge.recording.video.writer_process import VideoJob
+from mavbridge.recording.video_file import WRITE_ERRORS
+from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording.video_writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
 
 SCHEMA = pa.schema(

@@ -5,9 +5,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
 
 from mavbridge.commands.inspect.moments import (
     Arrivals,
@@ -16,34 +18,27 @@ from mavbridge.commands.inspect.moments import (
     is_gap,
     worst_moments,
 )
-from mavbridge.commands.inspect.series import (
-    FloatColumn,
-    TickSeries,
-    Track,
-    course_gates,
-    make_series,
-    read_track,
-)
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Solve, Tick
+from mavbridge.core.records import Position, Solve, Tick
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
+from mavbridge.observe.terminal import POOR, Verdict, number, rate_style, verdicts
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording import replay_tables
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.recording.folder import PACKETS, SOLVES
-from mavbridge.recording.meta import FlightError, FlightMeta
+from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
+from mavbridge.recording.folder import PACKETS, SOLVES, FlightError, FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.settings import read_settings
 from mavbridge.recording.tables import read_table, table_exists
 from policy.contract import Contract
 
+FloatColumn: TypeAlias = NDArray[np.float64]
 ATTITUDES = (30, 31)
 """Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 
@@ -107,31 +102,36 @@ def holder_spans(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Images:
-    """Exposures of one camera's images. Row k is image k of its video."""
+class Track:
+    """Positions in the order of time."""
 
-    camera: str
-    """Name in the contract."""
-    video: Path
-    exposed_s: FloatColumn
-    """[M] exposures in seconds since the first tick."""
-    latency_ms: Percentiles | None
-    """Time from the exposure to the finished feature; None without images."""
+    t_s: FloatColumn
+    """[M] seconds since the first tick."""
+    position_ned_m: FloatColumn
+    """[M, 3] from the estimator's origin."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path."""
+        steps_m = np.linalg.norm(np.diff(self.position_ned_m, axis=0), axis=1)
+        return float(steps_m.sum())
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightAnalysis:
     """One recorded flight."""
 
-    folder: Path
-    meta: FlightMeta
+    cameras: dict[str, RecordedFlight]
+    """The recording with the images of each camera, by name, in the contract's order."""
+    start_ns: int
+    """Wake-up of the first tick, on the clock of all stamps."""
     stick_hz: float
     """Rate of the stick grid, derived from the slots themselves."""
     report: TimingReport
-    """Figures of the table that ended the flight, except for those of the link."""
-    series: TickSeries
-    cameras: tuple[Images, ...]
-    """Cameras in the contract's order; ``report`` describes the first one."""
+    """Figures of the table that ended the flight, except for those of the link; vision is that of
+    the first camera."""
+    image_latency_ms: dict[str, Percentiles | None]
+    """Time from the exposure to the finished feature, by camera; None without images."""
     track: Track | None
     """None if no position is known."""
     gates: tuple[CourseGate, ...]
@@ -147,23 +147,30 @@ class FlightAnalysis:
     """Skipped parts of the recording, in sentences for the user."""
 
     @property
-    def images(self) -> Images:
-        """Images of the first camera."""
-        return self.cameras[0]
+    def recorded(self) -> RecordedFlight:
+        """The recording, with the images of its first camera."""
+        return next(iter(self.cameras.values()))
 
     @property
-    def times_ms(self) -> tuple[tuple[str, Percentiles | None], ...]:
+    def folder(self) -> Path:
+        """Folder of the flight."""
+        return self.recorded.folder
+
+    @property
+    def meta(self) -> FlightMeta:
+        """Facts about the flight."""
+        return self.recorded.meta
+
+    @property
+    def ticks(self) -> pa.Table:
+        """Table of all N ticks."""
+        return self.recorded.ticks
+
+    @property
+    def times_ms(self) -> dict[str, Percentiles | None]:
         """Measured times by name; None: not measured."""
-        report = self.report
-        return (
-            ("stick lateness", report.sticks.lateness_ms),
-            ("chunk period", report.action.period_ms),
-            ("predict", report.action.predict_ms),
-            ("feature age at send", report.feature_age_ms),
-            ("attitude age at send", report.state_age_ms),
-            ("new attitude to wire", report.state_to_wire_ms),
-            ("exposure to feature", self.images.latency_ms),
-        )
+        first = next(iter(self.image_latency_ms.values()))
+        return self.report.times_ms | {"exposure to feature": first}
 
     @property
     def causes(self) -> tuple[tuple[str, int], ...]:
@@ -177,12 +184,15 @@ class FlightAnalysis:
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
-    flight = open_flight(folder)
+    flight, *others = open_cameras(folder)
     _require_sound(flight)
+    contract = flight.meta.contract
+    names = ("front",) if contract is None else contract.cameras
+    cameras = dict(zip(names, (flight, *others), strict=True))
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
-    damage = list(flight.damage)
-    series = make_series(flight)
+    damage = [text for camera in cameras.values() for text in camera.damage]
+    start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
     stick_hz = _stick_hz(ticks, flight.meta)
     delays = find_delays(
         ticks,
@@ -190,17 +200,16 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         action_hz=flight.meta.action_hz,
         arrivals=_read_arrivals(folder, damage),
     )
-    limits = _flown_limits(folder, flight.meta.contract)
+    limits = _flown_limits(folder, contract)
     return FlightAnalysis(
-        folder=folder,
-        meta=flight.meta,
+        cameras=cameras,
+        start_ns=start_ns,
         stick_hz=stick_hz,
         report=_report(flight, ticks, frames, stick_hz),
-        series=series,
-        cameras=tuple(_cameras(flight, frames, series.start_ns, damage)),
-        track=read_track(series, frames),
+        image_latency_ms={name: _image_latency_ms(each) for name, each in cameras.items()},
+        track=_track(ticks, frames, start_ns),
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
-        holders=holder_spans(ticks, series.start_ns, keeps_neutral=flight.meta.keeps_neutral),
+        holders=holder_spans(ticks, start_ns, keeps_neutral=flight.meta.keeps_neutral),
         delays=delays,
         moments=worst_moments(flight, ticks, frames, delays, limits),
         limits=limits,
@@ -265,9 +274,7 @@ def _losses(flight: RecordedFlight) -> int:
     counts = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
     if any(count is not None for count in counts):
         return sum(count or 0 for count in counts)
-    others = () if meta.contract is None else meta.contract.cameras[1:]
-    frames = [open_flight(flight.folder, name).frames for name in others]
-    tables = (flight.ticks, flight.frames, *frames)
+    tables = (flight.ticks, *(camera.frames for camera in open_cameras(flight.folder)))
     return sum(sum(table.column("dropped_before").to_pylist()) for table in tables)
 
 
@@ -286,31 +293,37 @@ def _vision(frames: Sequence[FrameRow], visual_hz: float) -> VisionReport:
     )
 
 
-def _cameras(
-    flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int, damage: list[str]
-) -> Iterator[Images]:
-    contract = flight.meta.contract
-    names = ("front",) if contract is None else contract.cameras
-    yield _images(names[0], flight, frames, start_ns)
-    for name in names[1:]:
-        other = open_flight(flight.folder, name)
-        damage += other.damage
-        yield _images(name, other, list(other.frame_rows()), start_ns)
-
-
-def _images(
-    camera: str, flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int
-) -> Images:
+def _image_latency_ms(camera: RecordedFlight) -> Percentiles | None:
     latency = Histogram()
-    for frame in frames:
+    for frame in camera.frame_rows():
         latency.add(frame.ready_ns - frame.captured_ns)
-    exposed_ns = np.array([frame.captured_ns for frame in frames], np.int64)
-    return Images(
-        camera=camera,
-        video=flight.folder / flight.video,
-        exposed_s=(exposed_ns - start_ns) / NS_PER_S,
-        latency_ms=latency.percentiles_ms(),
+    return latency.percentiles_ms()
+
+
+def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
+    """Return the gates of a simulated course; none without a seed."""
+    if seed is None:
+        return ()
+    from sitl.course import make_course
+
+    return tuple(
+        CourseGate(Position(*gate.center_ned_m), gate.yaw_rad, gate.size_m)
+        for gate in make_course(seed).gates
     )
+
+
+def _track(ticks: Sequence[Tick], frames: Sequence[FrameRow], start_ns: int) -> Track | None:
+    """Return the simulator's true positions, else the positions in the ticks."""
+    known = [
+        (frame.captured_ns, frame.truth.position_ned_m)
+        for frame in frames
+        if frame.truth is not None
+    ] or [(tick.woke_ns, tick.position_ned_m) for tick in ticks if tick.position_ned_m is not None]
+    if not known:
+        return None
+    stamps_ns, positions = zip(*known, strict=True)
+    t_s = (np.array(stamps_ns) - start_ns) / NS_PER_S
+    return Track(t_s=t_s, position_ned_m=np.array(positions))
 
 
 def _flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
@@ -340,8 +353,42 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
     return Arrivals(columns["happened_ns"][rows], columns["arrived_ns"][rows])
 
 
-def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
+def recorded_solves(flight: RecordedFlight) -> Iterator[Solve]:
     """Return the policy's solves in the order of time; nothing if they were not recorded."""
-    if contract is not None and table_exists(folder / SOLVES):
-        table = read_table(folder / SOLVES, replay_tables.SOLVES)
-        yield from (row.solve for row in replay_tables.read_solves(table, contract))
+    contract, stem = flight.meta.contract, flight.folder / SOLVES
+    if contract is not None and table_exists(stem):
+        table = read_table(stem, replay_tables.SOLVES)
+        yield from replay_tables.read_solves(table, contract)
+
+
+def flight_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:
+    """Yield the verdicts on the loops, or on a pilot's rows; then image latencies and causes."""
+    report = flight.report
+    if flight.meta.source == "pilot":
+        yield from _pilot_verdicts(flight)
+    else:
+        yield from verdicts(report)
+    for camera, latency in flight.image_latency_ms.items():
+        if latency is not None:
+            text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
+            yield Verdict("images", f"{camera}: {text}" if len(flight.cameras) > 1 else text)
+    if flight.causes:
+        causes = ", ".join(f"{cause} ({count})" for cause, count in flight.causes)
+        yield Verdict("causes", causes, POOR)
+
+
+def _pilot_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:
+    """Yield the verdicts on a recording in which no policy flew."""
+    report, sticks = flight.report, flight.ticks["rc_sticks"]
+    is_timed = len(sticks) > 1 and report.duration_s > 0
+    rows_hz = (len(sticks) - 1) / report.duration_s if is_timed else None
+    known = 1 - sticks.null_count / max(len(sticks), 1)
+    share = f", the pilot's sticks known in {known:.1%} of them" if len(sticks) else ""
+    for name, rate_hz, target_hz, rest in (
+        ("rows", rows_hz, flight.meta.action_hz, share),
+        ("vision", report.vision.rate_hz, report.vision.target_hz, ""),
+    ):
+        text = f"{number(rate_hz, 1)} Hz of {target_hz:.4g} Hz{rest}"
+        yield Verdict(name, text, rate_style(rate_hz, target_hz))
+    if report.observer_drops.recorder:
+        yield Verdict("recorder", f"missed {report.observer_drops.recorder} events", POOR)

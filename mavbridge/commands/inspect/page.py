@@ -10,14 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from mavbridge.commands.inspect.analysis import FlightAnalysis
-from mavbridge.commands.inspect.series import FloatColumn
+from mavbridge.commands.inspect.analysis import FlightAnalysis, FloatColumn, flight_verdicts
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.files import write_output
+from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind
 from mavbridge.flight.outcome import describe
-from mavbridge.observe.report_table import number
-from mavbridge.observe.viewer.layout import action_title
+from mavbridge.observe.terminal import BAD, POOR
+from mavbridge.observe.viewer_layout import action_title
+from policy.adapters.interface import EULER_NAMES, state_values
+from policy.contract import RATE, STATE_NAMES, VELOCITY
+from policy.motion.rotation import other_frame
 
 MAX_VIDEO_BYTES = 40_000_000
 """A larger video stays beside the page: larger data URLs make browsers slow."""
@@ -49,13 +54,13 @@ def page_data(flights: Sequence[FlightAnalysis]) -> str:
 
 
 def _flight(flight: FlightAnalysis) -> dict[str, Any]:
-    series = flight.series
+    t_s = (flight.ticks["woke_ns"].to_numpy() - flight.start_ns) / NS_PER_S
     return {
         "name": str(flight.folder),
         "outcome": _outcome(flight),
         "facts": list(_facts(flight)),
-        "end_s": float(series.t_s[-1]) if len(series.t_s) else 0.0,
-        "t": _packed(series.t_s),
+        "end_s": float(t_s[-1]) if len(t_s) else 0.0,
+        "t": _packed(t_s),
         "plots": [plot for plot in _plots(flight) if plot["series"]],
         "holders": [asdict(span) | {"reason": str(span.reason or "")} for span in flight.holders],
         "moments": [asdict(moment) for moment in flight.moments],
@@ -79,7 +84,6 @@ def _outcome(flight: FlightAnalysis) -> dict[str, str] | None:
 def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     """Yield label, text, and True if the fact is bad news."""
     report, meta = flight.report, flight.meta
-    sticks, action, vision = report.sticks, report.action, report.vision
     yield "policy", f"{report.policy} on {report.engine}, {report.mode} rate", False
     yield "vehicle", report.autopilot or "none", False
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
@@ -91,54 +95,80 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
         yield "damage", text, True
     if meta.gates_passed is not None:
         yield "course", f"{meta.gates_passed} gates passed", meta.success is False
-    missed = (
-        f"{sticks.missed_slots} of {sticks.slots} slots missed, {sticks.coasting_sends} coasting"
-    )
-    yield "sticks", f"{flight.stick_hz:g} Hz grid, {missed}", sticks.missed_slots > 0
-    late, shown = f"{action.late_chunks} late", f"{vision.frames} in all"
-    for name, loop, rest in (("chunks", action, late), ("images", vision, shown)):
-        is_slow = loop.rate_hz is not None and loop.rate_hz < 0.9 * loop.target_hz
-        yield name, f"{number(loop.rate_hz, 1)} of {loop.target_hz:.4g} Hz, {rest}", is_slow
-    for name, measured in flight.times_ms:
+    for verdict in flight_verdicts(flight):
+        yield verdict.name, verdict.text, verdict.style in (POOR, BAD)
+    for name, measured in flight.times_ms.items():
         if measured is not None:
             p50, p99 = f"p50 {measured.p50:.2f}", f"p99 {measured.p99:.2f}"
             yield name, f"{p50}, {p99}, most {measured.max:.2f} ms", False
-    for cause, count in flight.causes:
-        yield "delayed", f"{cause} ({count})", False
 
 
 def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
-    series = flight.series
-    is_sticks = series.action_names == ("throttle", "yaw", "pitch", "roll")
-    for axis, name in enumerate(series.action_names):
-        columns = {
-            ECHO: series.echo[:, axis] if is_sticks else np.array([np.nan]),
-            "raw": series.raw[:, axis],
-            "smoothed": series.smoothed[:, axis],
-            "sent": series.sent[:, axis],
-        }
-        span = {"range": [-1.08, 1.08]} if is_sticks else {}
+    """Yield the plots of all N ticks, in NED and FRD for any policy; NaN for missing values."""
+    contract = flight.meta.contract
+    yield from _action_plots(flight.ticks, "sticks" if contract is None else contract.action)
+    yield from _timing_plots(flight)
+    state = _vectors(flight.ticks["state"])
+    if contract is not None and contract.state_frame == "enu_flu":
+        state = other_frame(state)
+    angles_rad = np.stack(state_values(list(state.T), STATE_NAMES, EULER_NAMES), axis=-1)
+    for title, unit, names, values in (
+        ("Velocity", "m/s", ("north", "east", "down"), state[:, VELOCITY]),
+        ("Attitude", "deg", ("roll", "pitch", "yaw"), np.degrees(angles_rad)),
+        ("Body rates", "deg/s", ("roll", "pitch", "yaw"), np.degrees(state[:, RATE])),
+    ):
+        yield _plot(title, unit, dict(zip(names, values.T, strict=True)))
+    height_m = -_vectors(flight.ticks["position_ned_m"])[:, 2]
+    yield _plot("Height above the origin", "m", {"height": height_m})
+
+
+def _action_plots(ticks: pa.Table, action: ActionKind) -> Iterator[dict[str, Any]]:
+    """Yield a plot for each number of the actions, from the policy to the message."""
+    is_sticks = action == "sticks"
+    stages = {name: _vectors(ticks[name]) for name in ("raw", "smoothed", "sent")}
+    if is_sticks:  # the echo of other actions is none of theirs
+        stages = {ECHO: _vectors(ticks["rc_sticks"])} | stages
+    for axis, name in enumerate(ACTION_CLASSES[action]._fields):
         title = f"Stick: {name}" if is_sticks else action_title(name)
-        yield _plot(title, "", columns) | span
-    ages = {"feature": series.feature_age_ms, "attitude": series.state_age_ms}
-    ages_ms: dict[str, float] = {}
-    if (limits := flight.limits) is not None:
-        ages_ms = {
+        plot = _plot(title, "", {stage: values[:, axis] for stage, values in stages.items()})
+        yield plot | ({"range": [-1.08, 1.08]} if is_sticks else {})
+
+
+def _timing_plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
+    """Yield the ages of what the sticks are based on, and the lateness of their sends."""
+    ticks, limits = flight.ticks, flight.limits
+    is_flown = ticks["raw"].is_valid()
+    is_slot = pc.and_(is_flown, pc.fill_null(ticks["is_slot"], False))
+
+    def before_send_ms(earlier: str, where: pa.ChunkedArray = is_flown) -> FloatColumn:
+        lasted_ns = pc.subtract(ticks["sent_ns"], ticks[earlier])
+        return np.asarray(pc.if_else(where, lasted_ns, None), np.float64) / NS_PER_MS
+
+    ages = {
+        "feature": before_send_ms("feature_captured_ns"),
+        "attitude": before_send_ms("attitude_ns"),
+    }
+    limits_ms: dict[str, float] = {}
+    if limits is not None:
+        limits_ms = {
             "feature limit": limits.feature_ns / NS_PER_MS,
             "attitude limit": limits.state_ns / NS_PER_MS,
         }
-    yield _plot("Age when sent", "ms", ages, ages_ms) | {"fromZero": True}
-    if np.nanmax(series.lateness_ms, initial=0.0) > 0:  # none in simulated time
-        lateness = {"sticks after their slot": series.lateness_ms}
+    yield _plot("Age when sent", "ms", ages, limits_ms) | {"fromZero": True}
+    lateness_ms = np.maximum(before_send_ms("due_ns", is_slot), 0.0)
+    if np.nanmax(lateness_ms, initial=0.0) > 0:  # none in simulated time
+        lateness = {"sticks after their slot": lateness_ms}
         missed_ms = {"missed": NS_PER_S / NS_PER_MS / flight.stick_hz}
         yield _plot("Lateness", "ms", lateness, missed_ms) | {"fromZero": True}
-    for title, unit, names, values in (
-        ("Velocity", "m/s", ("north", "east", "down"), series.velocity_ned_mps),
-        ("Attitude", "deg", ("roll", "pitch", "yaw"), series.roll_pitch_yaw_deg),
-        ("Body rates", "deg/s", ("roll", "pitch", "yaw"), series.rate_frd_dps),
-    ):
-        yield _plot(title, unit, dict(zip(names, values.T, strict=True)))
-    yield _plot("Height above the origin", "m", {"height": -series.position_ned_m[:, 2]})
+
+
+def _vectors(column: pa.ChunkedArray) -> FloatColumn:
+    """Return a column of vectors as rows [N, D], NaN for null."""
+    rows = np.full((len(column), column.type.list_size), np.nan)
+    rows[column.is_valid().to_numpy()] = (
+        column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    )
+    return rows
 
 
 def _plot(
@@ -178,17 +208,18 @@ def _track(flight: FlightAnalysis) -> dict[str, str] | None:
 
 def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
     """Return the video, or a note why it is not in the page; None without images."""
-    images = flight.images
-    if not len(images.exposed_s):
+    recorded, contract = flight.recorded, flight.meta.contract
+    exposed_ns, video = recorded.frames["captured_ns"].to_numpy(), flight.folder / recorded.video
+    if not len(exposed_ns):
         return None
-    name, size, contract = images.video.name, images.video.stat().st_size, flight.meta.contract
+    name, size = video.name, video.stat().st_size
     if contract is not None and contract.is_depth:
         return {"note": f"{name} holds depth, which browsers do not play: see it by --rerun"}
     if size > MAX_VIDEO_BYTES:
         told = f"{name} has {size / 1e6:.0f} MB, too much for a page"
         return {"note": f"{told}: open it beside it"}
-    data = b64encode(images.video.read_bytes()).decode()
+    data = b64encode(video.read_bytes()).decode()
     return {
         "source": f"data:video/mp4;base64,{data}",
-        "exposed_s": _packed(images.exposed_s),
+        "exposed_s": _packed((exposed_ns - flight.start_ns) / NS_PER_S),
     }

@@ -8,13 +8,17 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from mavbridge.commands.config import InspectConfig
-from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse, recorded_solves
+from mavbridge.commands.inspect.analysis import (
+    FlightAnalysis,
+    analyse,
+    flight_verdicts,
+    recorded_solves,
+)
 from mavbridge.commands.inspect.page import write_page
 from mavbridge.commands.output import print_status, table_console, write_json
 from mavbridge.core.clock import NS_PER_S
@@ -24,12 +28,12 @@ from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
-from mavbridge.observe.report_table import number, rate_style, timing_table, verdicts
+from mavbridge.observe.terminal import BAD, Verdict, number, timing_table
 from mavbridge.observe.timing import report_document
-from mavbridge.observe.viewer.flight import RerunView
-from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.observe.viewer.target import check_target
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.observe.viewer import RerunView
+from mavbridge.observe.viewer_layout import ViewedFlight
+from mavbridge.observe.viewer_target import check_target
+from mavbridge.recording.flight_folder import RecordedFlight
 from policy.contract import Contract
 
 HOLDERS_SHOWN = 12
@@ -63,16 +67,8 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
     print_damage(flight, console)
     if (table := timing_table(flight.report)) is not None:
         console.print(table)
-    for line in _pilot_lines(flight) if flight.meta.source == "pilot" else verdicts(flight.report):
-        console.print(line)
-    for images in flight.cameras:
-        if (latency := images.latency_ms) is not None:
-            text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
-            name = f"{images.camera}: " if len(flight.cameras) > 1 else ""
-            console.print(Text.assemble(("images   ", "bold"), name + text))
-    if flight.causes:
-        causes = ", ".join(f"{cause} ({count})" for cause, count in flight.causes)
-        console.print(Text.assemble(("causes   ", "bold"), (causes, "yellow")))
+    for verdict in flight_verdicts(flight):
+        console.print(verdict.line)
     console.print(_holders_table(flight))
     console.print(_moments_table(flight))
 
@@ -80,7 +76,7 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
 def print_damage(flight: FlightAnalysis, console: Console) -> None:
     """Print the skipped parts of the recording."""
     for text in flight.damage:
-        console.print(Text.assemble(("damage   ", "bold"), (text, "red")))
+        console.print(Verdict("damage", text, BAD).line)
 
 
 def _facts(flight: FlightAnalysis) -> Iterator[Text]:
@@ -100,23 +96,6 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
     if flight.track is not None and len(flight.track.t_s):
         heights_m = -flight.track.position_ned_m[:, 2]
         yield Text(f"highest {heights_m.max():.1f} m, path of {flight.track.length_m:.0f} m")
-
-
-def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
-    """Yield the lines that replace the loops' verdicts if no policy flew."""
-    t_s, vision = flight.series.t_s, flight.report.vision
-    rows_hz = (len(t_s) - 1) / t_s[-1] if len(t_s) > 1 and t_s[-1] > 0 else None
-    known = np.isfinite(flight.series.echo[:, 0])
-    share = f", the pilot's sticks known in {known.mean():.1%} of them" if len(known) else ""
-    for name, rate_hz, target_hz, rest in (
-        ("rows", rows_hz, flight.meta.action_hz, share),
-        ("vision", vision.rate_hz, vision.target_hz, ""),
-    ):
-        text = f"{number(rate_hz, 1)} Hz of {target_hz:.4g} Hz{rest}"
-        yield Text.assemble((f"{name:9}", "bold"), (text, rate_style(rate_hz, target_hz)))
-    if flight.report.observer_drops.recorder:
-        text = f"missed {flight.report.observer_drops.recorder} events"
-        yield Text.assemble((f"{'recorder':9}", "bold"), (text, "yellow"))
 
 
 def _holders_table(flight: FlightAnalysis) -> Table:
@@ -216,7 +195,7 @@ def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
     yield Figure("late chunks", "", action.late_chunks, 0)
     yield Figure("sends coasting", "", sticks.coasting_sends, 0)
     yield Figure("releases", "", report.release_count, 0)
-    for name, measured in flight.times_ms:
+    for name, measured in flight.times_ms.items():
         yield Figure(f"{name}, p50", "ms", None if measured is None else measured.p50, 2)
         yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
     path_m = flight.track.length_m if flight.track else None
@@ -264,8 +243,8 @@ def as_document(flight: FlightAnalysis) -> dict[str, object]:
         "stick_hz": flight.stick_hz,
         "report": report_document(flight.report),
         "image_latency_ms": {
-            images.camera: images.latency_ms and asdict(images.latency_ms)
-            for images in flight.cameras
+            camera: latency and asdict(latency)
+            for camera, latency in flight.image_latency_ms.items()
         },
         "causes": dict(flight.causes),
         "holders": [
@@ -294,19 +273,16 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
         ),
     )
     with closing(view):
-        events = _events(flight.folder, meta.contract)
+        events = _events(flight)
         while batch := list(islice(events, BATCH_EVENTS)):
             view.consume(batch)
 
 
-def _events(folder: Path, contract: Contract | None) -> Iterator[Observed]:
+def _events(flight: FlightAnalysis) -> Iterator[Observed]:
     """Yield ticks, solves, and the images of all cameras, in the order of time."""
-    first = open_flight(folder)
-    others = () if contract is None else contract.cameras[1:]
-    cameras = [first, *(open_flight(folder, name) for name in others)]
-    ticks: Iterator[Observed] = (row.tick for row in first.tick_rows())
-    images = [_images(recorded, number) for number, recorded in enumerate(cameras)]
-    return heapq.merge(ticks, recorded_solves(folder, contract), *images, key=_at_ns)
+    ticks: Iterator[Observed] = (row.tick for row in flight.recorded.tick_rows())
+    images = [_images(recorded, camera) for camera, recorded in enumerate(flight.cameras.values())]
+    return heapq.merge(ticks, recorded_solves(flight.recorded), *images, key=_at_ns)
 
 
 def _at_ns(event: Observed) -> int:

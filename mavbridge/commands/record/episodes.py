@@ -13,8 +13,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.recording.folder import META, prepare_folder
-from mavbridge.recording.meta import FlightMeta, write_meta
+from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 

@@ -46,9 +46,9 @@ from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import patient_console
-from mavbridge.observe.viewer.flight import RerunView
-from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.recording.meta import FlightMeta
+from mavbridge.observe.viewer import RerunView
+from mavbridge.observe.viewer_layout import ViewedFlight
+from mavbridge.recording.folder import FlightMeta
 
 STEP_S = 0.05
 MAX_KEYS = 64

@@ -18,8 +18,7 @@ from mavbridge.guard.channel import SocketPort
 from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.observe.report_table import number, rate_style
-from mavbridge.observe.terminal import FlightScreen, RateMeter
+from mavbridge.observe.terminal import FlightScreen, RateMeter, number, rate_style
 from policy.contract import Contract
 
 STICK_IDS = {"ardupilot": IDS["RC_CHANNELS"], "px4": IDS["MANUAL_CONTROL"]}

@@ -12,11 +12,17 @@ from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.tlog import read_tlog
 from mavbridge.recording import replay_tables, rows
-from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
-from mavbridge.recording.meta import FlightMeta, read_meta
+from mavbridge.recording.folder import (
+    PACKETS,
+    SOLVES,
+    TICKS,
+    TLOG,
+    FlightMeta,
+    features_of,
+    read_meta,
+)
 from mavbridge.recording.replay_tables import (
     PacketStamp,
-    SolveRow,
     packet_key,
     read_features,
     read_packets,
@@ -79,7 +85,7 @@ def open_source(folder: Path) -> ReplaySource:
         raise UserError(f"{folder} was flown without a policy: there is nothing to replay")
     flown = settings.config
     damage: list[str] = []
-    ticks, solves = _rows(folder, meta, meta.contract, damage)
+    ticks, solves, solves_lost = _rows(folder, meta, meta.contract, damage)
     stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
     log, skipped = read_tlog(folder / TLOG)
     if skipped:
@@ -93,7 +99,7 @@ def open_source(folder: Path) -> ReplaySource:
     features = _features(folder, meta, damage)
     lost = _lost(
         ticks=sum(row.dropped_before for row in ticks),
-        solves=sum(row.dropped_before for row in solves),
+        solves=solves_lost,
         packets=len(stamps) - sum(packet.happened_ns is not None for packet in packets),
     )
     return ReplaySource(
@@ -107,7 +113,7 @@ def open_source(folder: Path) -> ReplaySource:
             record=None,
         ),
         ticks=tuple(row.tick for row in ticks),
-        solves=tuple(row.solve for row in solves),
+        solves=tuple(solves),
         features=features,
         packets=packets,
         known_params=frozenset(
@@ -121,19 +127,19 @@ def open_source(folder: Path) -> ReplaySource:
 
 def _rows(
     folder: Path, meta: FlightMeta, contract: Contract, damage: list[str]
-) -> tuple[list[TickRow], list[SolveRow]]:
-    """Read ticks and solves; raise UserError if there are none."""
+) -> tuple[list[TickRow], list[Solve], int]:
+    """Read ticks, solves and the number of lost solves; raise UserError without ticks or solves."""
     table = read_table(folder / TICKS, rows.TICKS, damage=damage)
     ticks = list(rows.read_ticks(table, contract.action))
     table = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
     solves = list(read_solves(table, contract))
     if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
-        solves = [row for row in solves if row.solve.started_ns <= ticks[-1].tick.sent_ns]
+        solves = [solve for solve in solves if solve.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solves:
         raise UserError(
             f"{folder} ended before its policy had computed anything: nothing to replay"
         )
-    return ticks, solves
+    return ticks, solves, sum(table["dropped_before"].to_pylist())
 
 
 def _lost(**counts: int) -> Iterator[str]:

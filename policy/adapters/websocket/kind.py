@@ -5,14 +5,13 @@ msgpack and websockets are an extra; only loading such a policy imports them.
 
 import os
 from dataclasses import fields, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from policy.adapters.interface import Interface, read_interface, read_tables
 from policy.contract import LIMIT_TERMS, Contract
-from policy.errors import ContractError, PolicyError
+from policy.errors import ContractError, PolicyError, require_packages
 from policy.files import parse_object
 
 if TYPE_CHECKING:
@@ -27,16 +26,9 @@ TERMS = ("play_s", "modes", *LIMIT_TERMS)
 """Contract fields of mavbridge's own server that a contract file may replace: flight terms."""
 
 
-def require_packages(what: str) -> None:
-    """Raise PolicyError if the extra is missing."""
-    if missing := [name for name in PACKAGES if find_spec(name) is None]:
-        names = " and ".join(missing), " ".join(missing)
-        raise PolicyError("{} needs {}: pip install {}".format(what, *names))
-
-
 def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
     """Raise PolicyError for an unusable address, contract file or flag; takes milliseconds."""
-    require_packages(f"--policy {url}")
+    require_packages(f"--policy {url}", *PACKAGES)
     try:
         parts = urlsplit(url)
         is_good = bool(parts.hostname) and (parts.port is not None or parts.scheme == "wss")

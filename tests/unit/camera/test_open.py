@@ -12,8 +12,8 @@ from helpers.fakes import START_NS
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from mavbridge.core.errors import CameraError, UserError
-from mavbridge.recording.video.file import FragmentedMp4
+from mavbridge.core.errors import CameraError, MavbridgeError, UserError
+from mavbridge.recording.video_file import FragmentedMp4
 from sitl.camera.shm import FramePublisher
 
 needs_shm = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
@@ -121,7 +121,7 @@ def test_a_device_that_is_not_there_is_refused():
 def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
-    with pytest.raises(UserError, match=r"pip install "):
+    with pytest.raises(MavbridgeError, match=r"pip install "):
         check_camera("screen:")
 
 

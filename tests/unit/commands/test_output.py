@@ -5,14 +5,14 @@ import pytest
 from rich.text import Text
 
 from mavbridge.commands.output import make_table, print_status, require_outputs, text_console
-from mavbridge.core.errors import UserError
+from mavbridge.core.errors import MavbridgeError
 
 
 def test_a_figure_without_matplotlib_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(UserError, match=r"--plot needs matplotlib: pip install"):
+    with pytest.raises(MavbridgeError, match=r"--plot needs matplotlib: pip install"):
         require_outputs(None, tmp_path / "a.png")
 
 

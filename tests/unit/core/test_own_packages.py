@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.core.own_packages import OUR_SAFE_PATH, OURS, SAFE_PATH
+from mavbridge import OUR_SAFE_PATH, SAFE_PATH
+from mavbridge.__main__ import PACKAGES
 from mavbridge.core.processes import child_environment, user_environment
 from policy.adapters.user_class import load_user_class
 from policy.errors import PolicyError
@@ -27,7 +28,7 @@ def start(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize(("name", "is_folder"), [*zip(OURS, (False, True), strict=True)])
+@pytest.mark.parametrize(("name", "is_folder"), [*zip(PACKAGES, (False, True), strict=True)])
 def test_a_file_that_hides_one_of_ours_is_named(tmp_path: Path, name: str, is_folder: bool) -> None:
     hiding = tmp_path / name / "__init__.py" if is_folder else tmp_path / f"{name}.py"
     hiding.parent.mkdir(exist_ok=True)

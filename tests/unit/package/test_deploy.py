@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from helpers.status import asked_flight
-from mavbridge.camera.open import SCREEN_PACKAGES
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.recording.folder import EXTRA
 from policy.files import read_toml
@@ -45,7 +44,7 @@ def test_messages_name_the_packages_of_the_extras() -> None:
     ]
     names = {extra: {line.split(">")[0] for line in lines} for extra, lines in extras.items()}
     assert names["record"] == set(EXTRA)
-    assert names["screen"] == set(SCREEN_PACKAGES.values())
+    assert names["screen"] == {"mss", "python-xlib"}
 
 
 def test_the_simulator_says_what_it_lacks() -> None:

@@ -15,8 +15,7 @@ from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay import replay
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError
-from mavbridge.recording.folder import SETTINGS
-from mavbridge.recording.meta import FlightError, read_meta
+from mavbridge.recording.folder import SETTINGS, FlightError, read_meta
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import decode_video
 from policy.data.lerobot import read_dataset

@@ -14,7 +14,7 @@ from helpers.recordings import make_frame, number_of, write_recording
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.folder import FlightError
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight
 from policy.data.flight_video import video_parts

@@ -19,8 +19,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import prepare_folder
-from mavbridge.recording.meta import FlightError, read_meta, write_meta
+from mavbridge.recording.folder import FlightError, prepare_folder, read_meta, write_meta
 from policy.contract import Contract
 
 
@@ -179,7 +178,7 @@ def test_a_folder_that_cannot_take_a_flight_is_refused(
     with pytest.raises(UserError, match="--out /proc/nowhere cannot be written"):
         prepare_folder(Path("/proc/nowhere"), "--out")
     monkeypatch.setattr(names, "EXTRA", ("av", "no_such_module"))
-    with pytest.raises(UserError, match=r"needs no_such_module: pip install no_such_module"):
+    with pytest.raises(MavbridgeError, match=r"needs no_such_module: pip install no_such_module"):
         prepare_folder(tmp_path / "new", "--out")
 
 

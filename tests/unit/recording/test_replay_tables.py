@@ -16,8 +16,7 @@ from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import flight_writer, replay_tables
 from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.folder import SETTINGS
-from mavbridge.recording.meta import FlightError
+from mavbridge.recording.folder import SETTINGS, FlightError
 from mavbridge.recording.replay_tables import packet_key, read_features, read_packets, read_solves
 from mavbridge.recording.settings import ReplaySettings, read_settings, write_settings
 from mavbridge.recording.tables import read_table
@@ -73,10 +72,10 @@ def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
     if is_finished:
         writer.finish(writer.meta)
 
-    rows = list(read_solves(read_table(tmp_path / "solves", replay_tables.SOLVES), CONTRACT))
+    table = read_table(tmp_path / "solves", replay_tables.SOLVES)
 
-    assert [row.dropped_before for row in rows] == [0, 0, 2]
-    assert [comparable(row.solve) for row in rows] == [*map(comparable, solves)]
+    assert table["dropped_before"].to_pylist() == [0, 0, 2]
+    assert [*map(comparable, read_solves(table, CONTRACT))] == [*map(comparable, solves)]
 
 
 def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> None:

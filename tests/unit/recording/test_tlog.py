@@ -13,8 +13,8 @@ from helpers.recordings import count_frames, make_row, picture
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
-from mavbridge.recording.video.writer import VideoWriter, WriterError
-from mavbridge.recording.video.writer_process import VideoJob
+from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording.video_writer import VideoWriter, WriterError
 
 DEADLINE_S = 30.0
 

@@ -14,14 +14,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.recordings import count_frames, make_row, number_of, picture, send_signal
+from mavbridge.recording import video_process, video_writer
 from mavbridge.recording.rows import FRAMES, read_frames
 from mavbridge.recording.tables import read_table
-from mavbridge.recording.video import ring
-from mavbridge.recording.video import writer as writer_module
-from mavbridge.recording.video.file import read_video
-from mavbridge.recording.video.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, allocate, ring_shape
-from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterError
-from mavbridge.recording.video.writer_process import Notice, VideoJob, WriterService
+from mavbridge.recording.video_file import read_video
+from mavbridge.recording.video_process import (
+    MAX_BYTES,
+    MAX_SLOTS,
+    MIN_SLOTS,
+    Notice,
+    VideoJob,
+    WriterService,
+    allocate,
+    ring_shape,
+)
+from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterError
 
 DEADLINE_S = 30.0
 
@@ -60,13 +67,13 @@ def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_
 
 
 def test_a_pause_of_both_processes_is_no_hang(tmp_path: Path) -> None:
-    wait, pauses = writer_module.wait, [[]]
+    wait, pauses = video_writer.wait, [[]]
 
     def paused_once(*ends_and_timeout: Any) -> list[Any]:
         return pauses.pop() if pauses else wait(*ends_and_timeout)
 
     with (
-        patch.object(writer_module, "wait", paused_once),
+        patch.object(video_writer, "wait", paused_once),
         writer(tmp_path, "offline") as video,
     ):
         video.submit(picture(0), make_row(0))
@@ -114,14 +121,14 @@ class Alive:
 @given(st.lists(st.integers(0, 3), max_size=60))
 def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
     """0..2: a frame is offered, with so many lost before it; 3: the writer does one thing."""
-    with TemporaryDirectory() as name, patch.object(ring, "MAX_SLOTS", MIN_SLOTS):
+    with TemporaryDirectory() as name, patch.object(video_process, "MAX_SLOTS", MIN_SLOTS):
         folder = Path(name)
         video, table = folder / "camera.mp4", folder / "frames"
         ours, its = Pipe()
         job = VideoJob(video, hz=30, rows=table)
         service = WriterService(its, job)
         service.send(Notice.READY)
-        with patch.object(writer_module, "start_process", lambda *_: (ours, Alive())):
+        with patch.object(video_writer, "start_process", lambda *_: (ours, Alive())):
             sender = VideoWriter(job, pressure="online")
         offered = lost_upstream = 0
         taken: list[int] = []

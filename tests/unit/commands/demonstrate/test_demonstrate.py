@@ -18,7 +18,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from mavbridge.recording.meta import write_meta
+from mavbridge.recording.folder import write_meta
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED, SHIPPED_RATES

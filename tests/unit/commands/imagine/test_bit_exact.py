@@ -20,7 +20,7 @@ from helpers.rollouts import (
     segments,
 )
 from mavbridge.commands.imagine.loop import DECIDE, SIMULATE, RolloutPlan
-from mavbridge.recording.video.file import read_video
+from mavbridge.recording.video_file import read_video
 
 THREAD = "mavbridge-rollout-decode"
 

@@ -19,7 +19,7 @@ from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import PolicyDecider, Sampler
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.video.file import read_video
+from mavbridge.recording.video_file import read_video
 from policy.checkpoints.networks import load_world_model, save_world_model
 from policy.preprocess import resize
 

@@ -19,7 +19,7 @@ from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video.file import read_video
+from mavbridge.recording.video_file import read_video
 
 DEADLINE_S = 60.0
 PLAN = make_plan(iterations=1000)

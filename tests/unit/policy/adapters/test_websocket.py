@@ -1,5 +1,6 @@
 """openpi's protocol: addresses, bytes written by hand from its definition, and observations."""
 
+import importlib.util
 import pickle
 from contextlib import suppress
 from dataclasses import replace
@@ -15,7 +16,6 @@ from hypothesis import strategies as st
 from mavbridge.commands.config import ServeConfig
 from mavbridge.config.policy import PolicyConfig
 from policy.adapters.interface import Interface
-from policy.adapters.websocket import kind
 from policy.adapters.websocket.kind import check_server
 from policy.adapters.websocket.messages import (
     MessageError,
@@ -59,8 +59,10 @@ def test_flags_and_packages_that_a_server_needs(tmp_path, monkeypatch):
         check_server(url, None, Path("my.safetensors"))
     with pytest.raises(PolicyError, match=r"--contract .*none\.toml"):
         check_server(url, tmp_path / "none.toml", None)
-    monkeypatch.setattr(kind, "find_spec", lambda name: None if name == "msgpack" else object())
-    with pytest.raises(PolicyError, match=r"needs msgpack: pip install msgpack"):
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "msgpack" else object()
+    )
+    with pytest.raises(MavbridgeError, match=r"needs msgpack: pip install msgpack"):
         check_server(url, None, None)
 
 

@@ -14,17 +14,20 @@ from typing import Literal
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video.ring import FrameRing, allocate, ring_shape, send_descriptor
-from mavbridge.recording.video.writer_process import (
+from mavbridge.recording.video_process import (
     NICENESS,
     Failed,
+    FrameRing,
     FromWriter,
     Notice,
     Submit,
     ToWriter,
     VideoJob,
     Written,
+    allocate,
+    ring_shape,
     run_writer,
+    send_descriptor,
 )
 
 Pressure = Literal["online", "offline"]

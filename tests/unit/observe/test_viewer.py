@@ -24,9 +24,8 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Observed, Position
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.observe.viewer import layout
-from mavbridge.observe.viewer.flight import EVENT_CHARACTERS, RerunView
-from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint, styles
+from mavbridge.observe.viewer import EVENT_CHARACTERS, RerunView, layout
+from mavbridge.observe.viewer_layout import ViewedFlight, flight_blueprint, styles
 from policy.contract import Contract
 from policy.motion.stick_loop import GRAVITY_MPS2
 

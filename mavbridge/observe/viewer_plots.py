@@ -14,8 +14,8 @@ import rerun as rr
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick, VisionTick
 from mavbridge.core.vehicle import Action, Sticks
-from mavbridge.observe.viewer import layout
-from mavbridge.observe.viewer.layout import Plot, ViewedFlight
+from mavbridge.observe import viewer_layout as layout
+from mavbridge.observe.viewer_layout import Plot, ViewedFlight
 
 WINDOW_NS = NS_PER_S // 4
 

@@ -8,9 +8,10 @@ import pytest
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
-from mavbridge.observe.viewer import target
-from mavbridge.observe.viewer.flight import RerunRecording
-from mavbridge.observe.viewer.target import check_target, prepare_target, spawn_viewer
+from mavbridge.observe import viewer_target
+from mavbridge.observe.viewer import RerunView
+from mavbridge.observe.viewer_layout import ViewedFlight
+from mavbridge.observe.viewer_target import check_target, prepare_target, spawn_viewer
 
 LISTENS_UNTIL_KILLED = """
 import socket, sys
@@ -29,11 +30,12 @@ def bound_port() -> Iterator[int]:
 
 
 def test_a_file_that_was_cut_short_is_named(tmp_path: Path) -> None:
-    recording = RerunRecording("flight", str(tmp_path / "full.rrd"))
-    recording.stream = Mock()
-    recording.stream.flush.side_effect = RuntimeError("File-writer thread shut down")
+    facts = ViewedFlight(vision_hz=30, chunk_hz=100, stick_hz=100)
+    view = RerunView(str(tmp_path / "full.rrd"), facts)
+    view._stream = Mock()
+    view._stream.flush.side_effect = RuntimeError("File-writer thread shut down")
     with pytest.raises(MavbridgeError, match=r"full\.rrd is not complete .*: make room"):
-        recording.close()
+        view.close()
 
 
 def test_a_file_is_tried_and_not_left_behind(tmp_path: Path) -> None:
@@ -76,12 +78,12 @@ def test_a_viewer_is_accepted_if_it_listens(bound_port: int) -> None:
 
 def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port(socket.SOCK_STREAM)
-    monkeypatch.setattr(target, "SETTLE_S", 0.05)
-    viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=port)
-    assert viewer.poll() is None
+    monkeypatch.setattr(viewer_target, "SETTLE_S", 0.05)
+    spawned = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=port)
+    assert spawned.poll() is None
     socket.create_connection(("127.0.0.1", port), 10).close()
-    viewer.kill()
-    viewer.wait(10)
+    spawned.kill()
+    spawned.wait(10)
 
 
 def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: int) -> None:

@@ -14,58 +14,21 @@ from textwrap import wrap
 from uuid import uuid4
 
 import rerun as rr
-import rerun.blueprint as rrb
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
-from mavbridge.observe.viewer import layout
-from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint
-from mavbridge.observe.viewer.plots import ActionPlots, Columns, TimingPlots
-from mavbridge.observe.viewer.scene import PlanView, SceneView
-from mavbridge.observe.viewer.target import prepare_target
+from mavbridge.observe import viewer_layout as layout
+from mavbridge.observe.viewer_layout import ViewedFlight, flight_blueprint
+from mavbridge.observe.viewer_plots import ActionPlots, Columns, TimingPlots
+from mavbridge.observe.viewer_scene import PlanView, SceneView
+from mavbridge.observe.viewer_target import prepare_target
 
 EVENT_CHARACTERS = 64
 """Longer texts continue in the next line; the viewer cuts them off at the edge of its panel."""
 
 BATCHES_OF_ROWS = 3
 """Plots, the scene and the images advance in steps of this many batches."""
-
-
-class RerunRecording:
-    """One recording and its target. Every call can block while a viewer does not keep up."""
-
-    def __init__(self, application: str, target: str) -> None:
-        """Check the target, and start the viewer if it is to be spawned.
-
-        Args:
-            application: the viewer's name for the content.
-            target: that of ``prepare_target``.
-
-        Raises:
-            MavbridgeError: as in ``prepare_target``.
-        """
-        prepared = prepare_target(target)
-        self._file = prepared if isinstance(prepared, Path) else None
-        self._sink = rr.FileSink(self._file) if self._file else rr.GrpcSink(str(prepared))
-        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
-        self.stream = rr.RecordingStream(application, recording_id=uuid4())
-
-    def open(self, blueprint: rrb.Blueprint) -> None:
-        """Open the file or the connection, with this initial layout of the viewer."""
-        self.stream.set_sinks(self._sink, default_blueprint=blueprint)
-
-    def close(self) -> None:
-        """Deliver the rest and close; raise MavbridgeError if the viewer is gone, or the disk is
-        full."""
-        try:
-            self.stream.flush()
-            self.stream.disconnect()
-        except RuntimeError as error:
-            if self._file is not None:
-                told = f"{self._file} is not complete ({error}): make room on its disk"
-                raise MavbridgeError(told) from error
-            raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
 
 
 class RerunView:
@@ -76,22 +39,31 @@ class RerunView:
     """
 
     def __init__(self, target: str, flight: ViewedFlight, *, is_live: bool = False) -> None:
-        """Check the target; calls that can block are left to ``consume`` and ``close``.
+        """Check the target, and start the viewer if it is to be spawned.
+
+        Calls that can block are left to ``consume`` and ``close``.
 
         Args:
             target: that of ``prepare_target``.
             flight: facts known before the flight.
             is_live: a file is opened, and an older one replaced, only once the vehicle is heard.
                 False: a recording, whose images have no start of encoding and no count of drops.
+
+        Raises:
+            MavbridgeError: as in ``prepare_target``.
         """
         self._flight = flight
-        self._recording = RerunRecording("mavbridge", target)
+        prepared = prepare_target(target)
+        self._file = prepared if isinstance(prepared, Path) else None
+        self._sink = rr.FileSink(self._file) if self._file else rr.GrpcSink(str(prepared))
+        rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
+        self._stream = rr.RecordingStream("mavbridge", recording_id=uuid4())
         self._is_open = False
-        self._awaits_vehicle = is_live and target.endswith(".rrd")
+        self._awaits_vehicle = is_live and self._file is not None
         self._has_start = False
         self._until_ns = 0
         """Newest stamp of a plotted event."""
-        columns = Columns(self._recording.stream)
+        columns = Columns(self._stream)
         self._columns = columns
         self._timing = TimingPlots(columns, flight, is_live=is_live)
         self._actions = ActionPlots(columns, flight)
@@ -133,7 +105,11 @@ class RerunView:
             self._columns.flush()
 
     def close(self) -> None:
-        """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
+        """Deliver the rest, and block until it is taken.
+
+        Raises:
+            MavbridgeError: the viewer is gone, or the disk is full.
+        """
         if self._awaits_vehicle:
             return
         self._open()
@@ -141,15 +117,22 @@ class RerunView:
         if self._has_start:
             self._mark(self._until_ns)
         self._columns.flush()
-        self._recording.close()
+        try:
+            self._stream.flush()
+            self._stream.disconnect()
+        except RuntimeError as error:
+            told = f"the viewer did not take the whole recording: {error}"
+            if self._file is not None:
+                told = f"{self._file} is not complete ({error}): make room on its disk"
+            raise MavbridgeError(told) from error
 
     def _open(self) -> None:
         if self._is_open:
             return
         self._is_open = True
-        self._recording.open(flight_blueprint(self._flight))
+        self._stream.set_sinks(self._sink, default_blueprint=flight_blueprint(self._flight))
         for path, style in layout.styles(self._flight.contract.action):
-            self._recording.stream.log(path, style, static=True, strict=True)
+            self._stream.log(path, style, static=True, strict=True)
         self._scene.open()
 
     def _mark(self, stamp_ns: int) -> None:

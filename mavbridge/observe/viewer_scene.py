@@ -21,10 +21,10 @@ from mavbridge.core.records import (
 )
 from mavbridge.core.rotation import Quaternion, heading_rad
 from mavbridge.core.vehicle import Action
+from mavbridge.observe import viewer_layout as layout
 from mavbridge.observe.images import as_rgb, jpeg
-from mavbridge.observe.viewer import layout
-from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.observe.viewer.plots import Columns
+from mavbridge.observe.viewer_layout import ViewedFlight
+from mavbridge.observe.viewer_plots import Columns
 from policy.contract import StateFrame
 from policy.motion.forward_motion import ForwardMotion, VehicleMotion
 from policy.motion.rotation import conjugate, multiply, other_frame

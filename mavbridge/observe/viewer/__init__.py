@@ -1,1 +1,0 @@
-"""Rerun viewer for live, recorded and imagined flights."""

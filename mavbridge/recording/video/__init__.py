@@ -1,1 +1,0 @@
-"""Video files and the process that encodes them."""
