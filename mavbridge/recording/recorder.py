@@ -101,6 +101,12 @@ class Recorder(ObserverThread):
         return super().dropped + self._flight.frames_lost + packets
 
     @property
+    def loss(self) -> str | None:
+        """Why ticks or images are no longer recorded; None if all are. Readable by any thread."""
+        failure = self.failure or self._flight.writer.video_failure
+        return None if failure is None else str(failure)
+
+    @property
     def crash(self) -> str | None:
         """Description of the crash; None if none was seen. Readable by any thread."""
         return self._flight.crash_watch.reason
@@ -113,12 +119,12 @@ class Recorder(ObserverThread):
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
         writer = self._flight.writer
-        failure = self.failure or writer.video_failure
-        if failure is None and not self.dropped:
+        loss = self.loss
+        if loss is None and not self.dropped:
             counted = f"{writer.ticks} ticks and {writer.frames_written} frames"
             return f"recorded {counted} in {self._folder}"
         why = f"; {writer.misfit}" if writer.misfit else ", since the machine was too busy"
-        lacks = failure or f"{self.dropped} events were dropped{why}"
+        lacks = loss or f"{self.dropped} events were dropped{why}"
         return f"recorded in {self._folder}, not completely: {lacks}"
 
 

@@ -136,9 +136,9 @@ class Episode:
     @property
     def obstacle(self) -> str | None:
         """Why recording cannot go on, for the report of its end; None if it can."""
-        crash, failure = self.recorder.crash, self.recorder.failure
-        if failure is not None:
-            return f"an error ({failure})"
+        crash, loss = self.recorder.crash, self.recorder.loss
+        if loss is not None:
+            return f"an error ({loss})"
         return None if crash is None else f"a crash ({crash})"
 
     def emit(self, event: Event) -> None:

@@ -15,6 +15,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.video_writer import WriterDiedError
 
 PACKET = bytes(20)
 
@@ -122,6 +123,13 @@ def test_an_episode_cannot_go_on_after_a_crash_or_without_its_recorder(stand: St
     assert episode.obstacle == "a crash (it fell)"
     episode.recorder.failure = "the disk is full"
     assert episode.obstacle == "an error (the disk is full)"
+
+
+def test_an_episode_cannot_go_on_without_its_images(stand: Stand) -> None:
+    stand.episodes.begin()
+    episode = stand.episodes.current
+    episode.recorder._flight.writer.video_failure = WriterDiedError("the writer process has died")
+    assert episode.obstacle == "an error (the writer process has died)"
 
 
 def test_a_later_session_goes_on_counting(stand: Stand) -> None:
