@@ -231,18 +231,32 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
     interface = Interface(
         contract=contract,
         state_names=tuple(state.pop("names", ())),
-        state_scale=tuple(float(value) for value in state.pop("scale", ())),
-        state_key=str(state.pop("key", Interface.state_key)),
+        state_scale=_numbers("[state] scale", state.pop("scale", [])),
+        state_key=_text("[state] key", state.pop("key", Interface.state_key)),
         action_names=tuple(action.pop("names", ())),
-        action_key=str(action.pop("key", Interface.action_key)),
-        action_scale=tuple(float(value) for value in action.pop("scale", ())),
-        action_offset=tuple(float(value) for value in action.pop("offset", ())),
-        image_keys=tuple(str(images[name]) for name in contract.cameras) if images else (),
-        prompt=str(task.pop("prompt", "")),
+        action_key=_text("[action] key", action.pop("key", Interface.action_key)),
+        action_scale=_numbers("[action] scale", action.pop("scale", [])),
+        action_offset=_numbers("[action] offset", action.pop("offset", [])),
+        image_keys=tuple(_text(f"[images] {n}", images[n]) for n in contract.cameras if images),
+        prompt=_text("[task] prompt", task.pop("prompt", "")),
     )
     if rest := sorted((*data, *state, *action, *task)):
         raise ContractError(f"unknown entries {rest}")
     return interface
+
+
+def _numbers(name: str, values: object) -> tuple[float, ...]:
+    """Return a list of numbers that float32 holds, zero among them."""
+    numbers: list[Any] = values if isinstance(values, list) else [None]
+    if not all(type(n) in (int, float) and (n == 0 or 1e-30 < abs(n) < 1e30) for n in numbers):
+        raise ContractError(f"{name} must be a list of numbers, got {values!r}")
+    return tuple(map(float, numbers))
+
+
+def _text(name: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise ContractError(f"{name} must be a text, got {value!r}")
+    return value
 
 
 def is_unanswered(value: object) -> bool:

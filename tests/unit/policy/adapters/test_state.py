@@ -1,13 +1,15 @@
 """Numbers made of the contract's state, in numpy and torch."""
 
 import math
+import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from policy.adapters.interface import BODY_STATE_NAMES, DERIVED_NAMES, Interface
+from policy.adapters.interface import BODY_STATE_NAMES, DERIVED_NAMES, Interface, read_interface
 from policy.contract import STATE_NAMES, Contract
 from policy.errors import ContractError
 from policy.motion.rotation import multiply, rotate
@@ -85,3 +87,21 @@ def test_names_and_scales_that_do_not_fit_are_refused() -> None:
         Interface(contract=Contract(), state_names=("qw", "yaw_rad"), state_scale=(1.0,))
     with pytest.raises(ContractError, match=r"\['yaw_deg'\] are unknown.*vx_mps.*yaw_rad"):
         Interface(contract=Contract(), state_names=("yaw_deg",))
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *("[state]\nscale = '1234567890123'", "[action]\nscale = '1234'"),
+        *("[action]\noffset = [true, 0, 0, 0]", "[action]\nscale = ['2', 1, 1, 1]"),
+        *("[action]\nscale = [nan, 1, 1, 1]", "[action]\noffset = [inf, 0, 0, 0]"),
+        *("[action]\nscale = [1e-300, 1, 1, 1]", "[action]\nscale = 2"),
+        *("[state]\nkey = 5", "[images]\nfront = ['rgb']", "[task]\nprompt = ['fly']"),
+    ],
+)
+def test_an_entry_of_another_type_is_refused_by_its_name(entry: str, tmp_path: Path) -> None:
+    path = tmp_path / "contract.toml"
+    path.write_text(entry)
+    table, name = entry.replace("\n", " ").split()[:2]
+    with pytest.raises(ContractError, match=rf"{re.escape(table)} {name} must be a (list|text)"):
+        read_interface(path)
