@@ -14,7 +14,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import STICK_TERMS, Contract
 from policy.data.flight_data import DatasetError, FlightData, common_contract
-from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.data.flight_folders import find_flights, leave_out_failed, read_flights
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.runner import require_device
 from policy.loading.builtin import builtin_config
@@ -127,12 +127,12 @@ def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightDa
     console = text_console(stderr=True)
     if note is not None:
         console.print(note, soft_wrap=True)
-    flights = [read_flight(folder, camera_key) for folder in folders]
+    flights, left_out = read_flights(folders, camera_key)
     several = [flight for flight in flights if len(flight.contract.cameras) > 1]
     if several and camera_key is None:
         name, cameras = several[0].name, list(several[0].contract.cameras)
         raise UserError(f"{name}: several cameras {cameras}: name one by --camera-key")
     if camera_key is not None and not (several or datasets):
         raise UserError("--camera-key names one of several cameras; these flights have one")
-    print_warnings(console, [text for flight in flights for text in flight.damage])
+    print_warnings(console, left_out + [text for flight in flights for text in flight.damage])
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

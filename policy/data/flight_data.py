@@ -29,6 +29,10 @@ class DatasetError(PolicyError):
     """Flights that cannot be learned from; the message names them and the reason."""
 
 
+class NothingToLearnError(DatasetError):
+    """Flight that adds nothing to others: nobody flew in it, or it is a copy."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FlightData:
     """One flight; all stamps are of one monotonic clock and never decrease."""

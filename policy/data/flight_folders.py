@@ -1,12 +1,13 @@
 """Reads the project's flight folders (docs/formats.md)."""
 
+import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import av
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -16,10 +17,10 @@ from policy.data.flight_data import (
     GATE_DIM,
     DatasetError,
     FlightData,
-    ImageArray,
     Nanoseconds,
+    NothingToLearnError,
 )
-from policy.data.flight_video import decode_images, video_parts, with_images
+from policy.data.flight_video import decode_video, with_images
 from policy.data.tables import number_column, read_rows, retyped, stamps, vectors
 from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
@@ -126,6 +127,41 @@ def leave_out_failed(
     return exemplary, f"left out: {failed} of {len(folders)} flights that failed ({why}): {advice}"
 
 
+def read_flights(
+    folders: Sequence[Path],
+    camera: str | None = None,
+    progress: Callable[[], None] = lambda: None,
+) -> tuple[list[FlightData], list[str]]:
+    """Read flights, except copies of others and those in which nobody flew.
+
+    A copy could be both trained on and held out. Returns a sentence about each flight left out.
+    """
+    flights: list[FlightData] = []
+    left_out: list[DatasetError] = []
+    seen: dict[bytes, Path] = {}
+    for folder in folders:
+        try:
+            if (first := seen.setdefault(_digest(folder), folder)) != folder:
+                raise NothingToLearnError(f"{folder}: a copy of {first}")
+            flights.append(read_flight(folder, camera))
+        except NothingToLearnError as error:
+            left_out.append(error)
+        progress()
+    if left_out and not flights:
+        raise left_out[0]
+    return flights, [f"left out: {error}" for error in left_out]
+
+
+def _digest(folder: Path) -> bytes:
+    """Return a digest of what a flight is known by; a table may be either of two files."""
+    digest = hashlib.sha256()
+    for path in (*sorted(folder.glob("ticks.*")), folder / "meta.json", folder / "camera.mp4"):
+        if path.is_file():
+            with suppress(OSError), path.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.digest()
+
+
 def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     """Read one flight folder, complete or left by a crash, with one camera's images.
 
@@ -218,7 +254,7 @@ def _sticks(
         is_in_mode = np.isin(ticks["mode"].to_pylist(), contract.modes)
         is_target &= np.array(ticks["phase"]) == "flying" if is_policys else is_in_mode
     if not is_target.any():
-        raise DatasetError(
+        raise NothingToLearnError(
             f"{name}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks "
             f"of a pilot while armed and in {' or '.join(contract.modes)}"
         )
@@ -262,22 +298,6 @@ def read_ages(folder: Path) -> Nanoseconds:
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
-
-
-def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
-    """Yield the images with these numbers of a flight's video, [H, W, 3] RGB."""
-    count = 0
-    try:
-        for image in decode_images(path, video_parts(path), numbers.tolist()):
-            if image.ndim == 2:
-                raise DatasetError(f"{path} holds depth: training and export take RGB images")
-            yield np.asarray(image, np.uint8)
-            count += 1
-    except (av.FFmpegError, OSError, ValueError) as error:
-        raise DatasetError(
-            f"{why_unreadable(path, error)}; {count} of its {len(numbers)} images came before the "
-            "damage: leave this flight out if there is no other copy"
-        ) from error
 
 
 def _read_meta(folder: Path) -> dict[str, object]:

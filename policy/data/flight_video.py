@@ -16,6 +16,8 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from policy.contract import CameraImage
+from policy.data.flight_data import DatasetError, ImageArray
+from policy.files import why_unreadable
 
 _BOX_HEADER_BYTES = 8
 _KINDS = (b"ftyp", b"moov", b"moof", b"mdat", b"mfra", b"free")
@@ -176,6 +178,22 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
                     if not left:
                         return
         raise ValueError(f"{left} images are missing at its end")
+
+
+def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
+    """Yield the images with these numbers of a flight's video, [H, W, 3] RGB."""
+    count = 0
+    try:
+        for image in decode_images(path, video_parts(path), numbers.tolist()):
+            if image.ndim == 2:
+                raise DatasetError(f"{path} holds depth: training and export take RGB images")
+            yield np.asarray(image, np.uint8)
+            count += 1
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise DatasetError(
+            f"{why_unreadable(path, error)}; {count} of its {len(numbers)} images came before the "
+            "damage: leave this flight out if there is no other copy"
+        ) from error
 
 
 def _pixels(image: av.VideoFrame, converter: VideoReformatter) -> CameraImage:

@@ -33,7 +33,7 @@ from policy.data.flight_data import (
     Nanoseconds,
     common_contract,
 )
-from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.data.flight_folders import find_flights, leave_out_failed, read_flights
 from policy.data.interpolation import MAX_GAP_NS
 from policy.files import CONTRACT_FILE, read_object
 
@@ -156,15 +156,12 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         console.print(note, soft_wrap=True)
     with progress_bar(console) as progress, whole_or_nothing(config.out) as folder:
         reading = progress.add_task("reading flights", total=len(exemplary), status="")
-        episodes = []
-        for flight in exemplary:
-            episodes.append(read_flight(flight))
-            print_warnings(console, episodes[-1].damage)
-            progress.advance(reading)
+        episodes, left_out = read_flights(exemplary, progress=lambda: progress.advance(reading))
+        print_warnings(console, left_out + [text for each in episodes for text in each.damage])
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames, status="")
         summary = write_dataset(episodes, folder, config, lambda: progress.advance(writing))
-        write_contract(folder, exemplary, config)
+        write_contract(folder, [Path(each.name) for each in episodes], config)
     text_console().print(f"{config.out}: {summary}", soft_wrap=True)
     return 0
 

@@ -17,7 +17,7 @@ from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError
 from mavbridge.recording.folder import SETTINGS, FlightError, read_meta
 from policy.data.flight_data import DatasetError
-from policy.data.flight_folders import decode_video
+from policy.data.flight_video import decode_video
 from policy.data.lerobot import read_dataset
 from policy.files import read_toml
 

@@ -11,8 +11,7 @@ from helpers.recordings import count_frames, number_of, picture
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video_file import FragmentedMp4, VideoError, read_video
 from policy.data.flight_data import DatasetError
-from policy.data.flight_folders import decode_video
-from policy.data.flight_video import video_parts
+from policy.data.flight_video import decode_video, video_parts
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from mavbridge.commands.export.run import export, stretches, whole_or_nothing, w
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data import lerobot_format as names
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight
 from policy.data.lerobot import read_dataset
 from policy.data.lerobot_format import STATE_KEY
@@ -203,6 +203,17 @@ def test_the_command_exports_what_train_can_read(tmp_path: Path) -> None:
     assert len(read_dataset(tmp_path / "all")) == 3
 
 
+def test_a_flight_in_which_nobody_flew_does_not_keep_the_others_back(tmp_path: Path) -> None:
+    fly(tmp_path / "flights" / "flown")
+    fly(tmp_path / "flights" / "idle", expert=False, released=range(200))
+    status, text = told_by("export", tmp_path / "flights", "--out", tmp_path / "out")
+    assert (status, "idle: nobody to learn from" in text, "1 episodes" in text) == (0, True, True)
+    small = ("--policy", "toge:small:resnet8", "--image-size", "32", "--steps", "1")
+    out = ("--out", tmp_path / "a.safetensors")
+    status, text = told_by("train", tmp_path / "flights", *out, *small)
+    assert (status, "idle: nobody to learn from" in text) == (0, True)
+
+
 def _flights(*each: dict[str, Any]) -> Callable[[Path], None]:
     def prepare(root: Path) -> None:
         for number, changes in enumerate(each):
@@ -248,18 +259,17 @@ def full(*_: object, **__: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def interrupted(folder: Path, number: int = signal.SIGINT) -> FlightData:
+def interrupted(*_: object, number: int = signal.SIGINT, **__: object) -> None:
     assert signal.getsignal(number) is not signal.SIG_DFL
     signal.raise_signal(number)
-    return read_flight(folder)
 
 
 @pytest.mark.parametrize(
     ("name", "act", "status"),
     [
         ("dataset.pq.write_table", full, 2),
-        ("run.read_flight", interrupted, 130),
-        ("run.read_flight", partial(interrupted, number=signal.SIGTERM), 130),
+        ("run.read_flights", interrupted, 130),
+        ("run.read_flights", partial(interrupted, number=signal.SIGTERM), 130),
     ],
 )
 def test_nothing_is_left_of_an_export_that_breaks(

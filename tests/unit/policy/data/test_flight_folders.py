@@ -1,4 +1,5 @@
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from policy.data.flight_folders import (
     leave_out_failed,
     read_ages,
     read_flight,
+    read_flights,
 )
 
 WOKE = [0, 10 * MS, 20 * MS]
@@ -244,6 +246,21 @@ def test_a_flight_that_nothing_can_be_learned_from_is_refused(
         (folder / "meta.json").write_text(meta)
     with pytest.raises(DatasetError, match=says):
         read_flight(folder)
+
+
+def test_copies_and_flights_in_which_nobody_flew_are_left_out(tmp_path: Path) -> None:
+    """One of them must not keep the others from being learned from."""
+    first, idle = flight(tmp_path / "a"), flight(tmp_path / "b", expert=[None] * 3)
+    copy = Path(shutil.copytree(first, tmp_path / "copy"))
+    flights, left_out = read_flights([first, idle, copy])
+    assert [each.name for each in flights] == [str(first)]
+    assert [text.partition(": ")[2] for text in left_out] == [
+        f"{idle}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks of "
+        "a pilot while armed and in ALT_HOLD or ALTCTL",
+        f"{copy}: a copy of {first}",
+    ]
+    with pytest.raises(DatasetError, match="nobody to learn from"):
+        read_flights([idle])
 
 
 @pytest.mark.parametrize(
