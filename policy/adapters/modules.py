@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from policy.adapters.description import USUAL_NAMES, Description
 from policy.adapters.interface import Interface
+from policy.contract import ACTION_DIM
 from policy.engines.torch_engines import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
 from policy.files import library_name, why_unreadable
@@ -118,9 +119,10 @@ class ForwardPolicy(nn.Module):
         return self.to_chunk(self._call(image, *self._own(state, action_history)))
 
     def to_chunk(self, sample: Any) -> Any:
-        """Convert the policy's actions [B, L, 4] to the contract's; [B, 4] is a single action."""
-        if sample.ndim == 2 and self.contract.horizon == 1:
-            sample = sample[:, None]
+        """Convert the policy's actions [1, L, 4] to the contract's; axes of 1 may be missing."""
+        wanted = (1, self.contract.horizon, ACTION_DIM)
+        if (1, 1, *sample.shape)[-3:] == wanted:
+            sample = sample.reshape(wanted)
         return self._interface.to_actions(sample)
 
     def _own(self, state: Any, history: Any) -> tuple[Any, Any]:

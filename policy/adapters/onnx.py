@@ -117,7 +117,11 @@ class GraphFile:
             if (shape := port.get_partial_shape()).is_dynamic:
                 why = "which depends on the values of the inputs: export one of a fixed size"
                 raise CheckpointError(f"{path}: an output has the shape {shape}, {why}")
-        self.output_shape = tuple(self._model.outputs[0].shape)
+        self.output_shape, *carried = (tuple(port.shape) for port in self._model.outputs)
+        for (name, taken), given in zip(self.hidden.items(), carried, strict=True):
+            if taken != given:  # as a cache that grows by each call
+                told = f"{name} is {list(taken)} and its output {pairs[name]} {list(given)}"
+                raise CheckpointError(f"{path}: hidden input {told}: they must be of one shape")
 
     @signal_stack_kept()
     def compile(self, precision: Precision) -> RoleGraph:
@@ -148,12 +152,6 @@ class GraphFile:
                 raise CheckpointError(
                     f'{self._path} has no input {name} with an output {out}, as "hidden" in '
                     f"policy.json says; it has {sorted(inputs)} and {sorted(outputs)}"
-                )
-            taken, made = (_sizes(port) for port in (model.input(name), model.output(out)))
-            if taken != made:
-                raise CheckpointError(
-                    f"{self._path}: hidden input {name} is {list(taken)} and its output {out} "
-                    f"{list(made)}: they must be of one shape"
                 )
         return pairs
 
@@ -222,10 +220,12 @@ class GraphFile:
         model = self._model
         shapes = {}
         for port, role in zip(model.inputs, self.roles, strict=True):
-            scalar = role == "timestep" and port.get_partial_shape().rank == ov.Dimension(0)
-            shapes[port] = [] if scalar else list(wanted[role])
+            shapes[port] = list(wanted[role])
             declared = port.get_partial_shape()
             sizes = list(declared) if declared.rank.is_static else []
+            if declared.is_static and list(declared.to_shape()) == shapes[port][1:]:
+                shapes[port].pop(0)  # it has no axis for the batch
+                continue
             is_reshaped = role != "image" and 0 < len(sizes) != len(shapes[port])
             if is_reshaped and math.prod(_sizes(port)[1:]) == math.prod(shapes[port][1:]):
                 shapes[port] = [1, *_sizes(port)[1:]]  # the same numbers, flat or with more axes
@@ -372,7 +372,7 @@ class OnnxGraphs:
 
 
 def _with_feature(contract: Contract, encoder: GraphFile, path: Path) -> Contract:
-    dim = math.prod(encoder.output_shape[1:])
+    dim = math.prod(encoder.output_shape)
     if contract.feature_dim not in (0, dim):
         raise PolicyError(
             f"{path} makes {dim} numbers of an image, and the contract says feature_dim "

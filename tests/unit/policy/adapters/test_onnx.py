@@ -4,6 +4,7 @@ They fly as they are, or are refused in one sentence.
 """
 
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -26,7 +27,7 @@ from helpers.torch_policies import DUAL, SINGLE, WIDE, ForwardOnly, TwoRates, Wi
 from policy.adapters.export import export_onnx
 from policy.adapters.onnx import GraphFile, Wanted
 from policy.engines import choose
-from policy.engines.runner import ExecutionSettings
+from policy.engines.runner import ExecutionSettings, dummy_sample
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
@@ -244,6 +245,36 @@ def test_a_history_that_is_declared_flat_is_given_flat(tmp_path: Path, dim: int 
     assert act(fly(f"onnx:{tmp_path}")).tolist() == [[8.0] * 4]
 
 
+def test_a_graph_without_an_axis_for_the_batch_is_given_none(tmp_path: Path) -> None:
+    """A softmax over the first axis of four numbers, not over a batch of one."""
+    graphs.write_contract(tmp_path)
+    nodes = [
+        helper.make_node("ReduceMean", ["image", "sides"], ["colours"], keepdims=0),
+        helper.make_node("Concat", ["colours", "zero"], ["four"], axis=0),
+        helper.make_node("MatMul", ["obs", "w"], ["by_state"]),
+        helper.make_node("Add", ["four", "by_state"], ["scores"]),
+        helper.make_node("Softmax", ["scores"], ["actions"], axis=0),
+    ]
+    inputs: dict[str, tuple[int, tuple[int, ...]]] = {
+        "image": (graphs.FLOAT, (3, graphs.IMAGE_PX, graphs.IMAGE_PX)),
+        "obs": (graphs.FLOAT, (13,)),
+    }
+    weights = {
+        "sides": np.array([1, 2]),
+        "zero": np.zeros(1, np.float32),
+        "w": np.zeros((13, 4), np.float32),
+    }
+    outputs = {"actions": (graphs.FLOAT, (4,))}
+    graphs.save_graph(tmp_path / "policy.onnx", nodes, inputs, outputs, weights)
+    runner = fly(f"onnx:{tmp_path}")
+    green = np.zeros((graphs.IMAGE_PX, graphs.IMAGE_PX, 3), np.uint8)
+    green[..., 1] = 255
+    _, state, history = dummy_sample(runner.contract)
+    sticks = runner.act(runner.encode(green), state, history)
+    assert sticks.shape == (1, 1, 4)
+    assert sticks[0, 0] == pytest.approx(np.array([1, math.e, 1, 1]) / (3 + math.e), abs=1e-3)
+
+
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
 def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.write_contract(tmp_path)
@@ -319,6 +350,23 @@ def recurrent_encoder(folder: Path) -> None:
     (folder / "head.onnx").touch()
 
 
+def growing(folder: Path) -> None:
+    """Cache of all states so far, as transformers export it."""
+    nodes = [
+        helper.make_node("Unsqueeze", ["obs", "axis"], ["new"]),
+        helper.make_node("Concat", ["kv_in", "new"], ["kv_out"], axis=1),
+        helper.make_node("ReduceMean", ["kv_out", "axis"], ["mean"], keepdims=0),
+        helper.make_node("MatMul", ["mean", "w"], ["actions"]),
+    ]
+    outputs: dict[str, tuple[int, Any]] = {
+        "actions": (graphs.FLOAT, (1, 4)),
+        "kv_out": (graphs.FLOAT, (1, "all", 13)),
+    }
+    weights = {"axis": np.array([1]), "w": np.eye(13, 4, dtype=np.float32)}
+    inputs = {"obs": (graphs.FLOAT, (1, 13)), "kv_in": (graphs.FLOAT, (1, "past", 13))}
+    graphs.save_graph(folder / "policy.onnx", nodes, inputs, outputs, weights)
+
+
 class Deep(nn.Module):
     """Fails inside of torch."""
 
@@ -368,6 +416,10 @@ REFUSED: dict[str, tuple[Write, str]] = {
         ],
         r"h_in is \[1, 1, 3\] and its output actions \[1, 4\]",
     ),
+    "hidden that grows": (
+        growing,
+        r"kv_in is \[1, 1, 13\] and its output kv_out \[1, 2, 13\]: they must be of one shape",
+    ),
     "recurrent encoder": (
         recurrent_encoder,
         r"encoder\.onnx: an encoder cannot have a hidden state, got \['h_in'\]",
@@ -392,7 +444,7 @@ REFUSED: dict[str, tuple[Write, str]] = {
     ),
     "three actions": (
         lambda folder: one_node(folder, "MatMul", weight=np.zeros((13, 3), np.float32)),
-        r"onnx:.*its chunk is \[1, 1, 3\], and its last axis must be the 4 numbers",
+        r"onnx:.*its chunk is \[1, 3\], and its last axis must be the 4 numbers",
     ),
     "not a number": (
         lambda folder: one_node(folder, "MatMul", weight=np.full((13, 4), np.nan, np.float32)),
