@@ -16,7 +16,7 @@ from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
-from policy.contract import SINCE_EXPOSURE_DIM, Contract
+from policy.contract import SINCE_EXPOSURE_DIM, STICK_TERMS, Contract
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner
@@ -164,6 +164,17 @@ class Decider(Protocol):
         ...
 
 
+def require_terms(world: Contract, other: Contract, what: str) -> None:
+    """Raise UserError if the axes of the states, or what a stick did, are not the world model's."""
+    for name in ("state_frame", *STICK_TERMS):
+        ours, theirs = getattr(world, name), getattr(other, name)
+        if ours != theirs and not (name == "modes" and set(ours) & set(theirs)):
+            raise UserError(
+                f"the world model was trained with {name} {ours}, {what} has {theirs}: name two of "
+                "the same kind of flights"
+            )
+
+
 class PolicyDecider:
     """A policy as in flight: newest image, newest state, sent sticks."""
 
@@ -173,8 +184,8 @@ class PolicyDecider:
         """Check that policy and world model fit together.
 
         Raises:
-            UserError: their states are in different frames, or the policy takes inputs that are
-                not imagined.
+            UserError: states or sticks differ in meaning, or the policy takes inputs that are not
+                imagined.
         """
         seen = runner.contract
         if len(seen.cameras) > 1 or seen.observation_steps > 1 or seen.state_extras:
@@ -186,12 +197,7 @@ class PolicyDecider:
             raise UserError(
                 f"{runner.name} flies by {seen.action}; flights are imagined from sticks"
             )
-        ours, theirs = sampler.config.contract.state_frame, runner.contract.state_frame
-        if ours != theirs:
-            raise UserError(
-                f"the world model takes states in {ours}, the policy {runner.name} in "
-                f"{theirs}: use two that were trained on the same kind of flights"
-            )
+        require_terms(sampler.config.contract, seen, f"the policy {runner.name}")
         self.contract = runner.contract
         self._runner = runner
         self._frames = sampler.config.frames

@@ -18,6 +18,7 @@ from mavbridge.commands.imagine.loop import (
     RolloutStart,
     Sampler,
     WorldModelDecider,
+    require_terms,
     rollout,
     torch_threads,
 )
@@ -142,11 +143,10 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     """Read the context, from ``start_s`` after the first frame that has a state.
 
     Raises:
-        UserError: the flight is too short, has no states or images there, or has its states in
-            another frame.
+        UserError: the flight is too short, has no states or images there, or is of another kind.
         VideoError: its video is damaged.
     """
-    _require_state_frame(flight, config)
+    _require_same_kind(flight, config)
     captured_ns = flight.frames["captured_ns"].to_numpy()
     ticks = flight.ticks.filter(flight.ticks["state"].is_valid())
     if not (len(captured_ns) and ticks.num_rows):
@@ -190,18 +190,13 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     )
 
 
-def _require_state_frame(flight: RecordedFlight, config: WorldModelConfig) -> None:
-    contract, wanted = flight.meta.contract, config.contract.state_frame
-    if contract is None or contract.state_frame != wanted:
-        found = "an unknown frame" if contract is None else contract.state_frame
-        raise UserError(
-            f"--start {flight.folder} has its states in {found}, the world model takes {wanted}: "
-            "name a flight of that kind, or a world model that was trained on this one"
-        )
+def _require_same_kind(flight: RecordedFlight, config: WorldModelConfig) -> None:
+    what, contract = f"--start {flight.folder}", flight.meta.contract
+    if contract is None:
+        raise UserError(f"{what} has its states in an unknown frame: name another flight")
     if contract.action != "sticks":
-        raise UserError(
-            f"--start {flight.folder} was flown by {contract.action}, the world model takes sticks"
-        )
+        raise UserError(f"{what} was flown by {contract.action}, the world model takes sticks")
+    require_terms(config.contract, contract, what)
 
 
 def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks | None], ...]:

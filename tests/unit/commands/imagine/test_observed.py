@@ -3,6 +3,7 @@
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +81,23 @@ def test_a_policy_by_body_rates_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", action="rates")
     with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):
         PolicyDecider(noise_runner(other), make_sampler())
+
+
+@pytest.mark.parametrize(
+    ("term", "value"),
+    [("state_frame", "enu_flu"), ("full_lean_deg", 45.0), ("modes", ("LOITER",))],
+)
+def test_states_and_sticks_of_another_meaning_are_refused(
+    flight: Path, term: str, value: Any
+) -> None:
+    other = Contract(feature_dim=1, arrays="numpy", **{term: value})
+    with pytest.raises(UserError, match=f"trained with {term} .*the policy .* has "):
+        PolicyDecider(noise_runner(other), make_sampler())
+    opened = open_flight(flight)
+    with pytest.raises(UserError, match=f"trained with {term} .*--start .* has "):
+        read_start(replace(opened, meta=replace(opened.meta, contract=other)), TINY, 0.0)
+    one_mode = Contract(feature_dim=1, arrays="numpy", modes=("ALT_HOLD",))
+    assert PolicyDecider(noise_runner(one_mode), make_sampler()).contract is one_mode
 
 
 def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
