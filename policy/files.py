@@ -18,6 +18,8 @@ from policy.errors import CheckpointError, PolicyError
 
 CONTRACT_FILE = "mavbridge.toml"
 """File name of a contract beside a policy or dataset, where flights find it without --contract."""
+UNANSWERED = "?"
+"""Value in a contract file that the user has to replace."""
 MAX_TEXT_BYTES = 100_000_000
 MAX_TOML_BYTES = 64 * 1024
 MAX_TOML_LINE = 2_000

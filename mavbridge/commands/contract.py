@@ -15,10 +15,9 @@ from policy.adapters.drafts import (
     onnx_entries,
     onnx_files,
 )
-from policy.adapters.interface import UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE
 from policy.data.lerobot import is_lerobot
-from policy.files import CONTRACT_FILE, read_text, read_toml
+from policy.files import CONTRACT_FILE, UNANSWERED, read_text, read_toml
 
 
 def contract(source: Path, config: ContractConfig) -> int:

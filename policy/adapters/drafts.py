@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from policy import files
 from policy.adapters.description import read_graph
-from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, UNANSWERED, is_unanswered
+from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, is_unanswered
 from policy.adapters.lerobot.config import CONFIG_FILE, read_json
 from policy.contract import (
     ACTION_DIM,
@@ -33,6 +33,7 @@ from policy.data.lerobot_format import (
     noted_frame,
 )
 from policy.errors import CheckpointError
+from policy.files import UNANSWERED
 
 Table = Literal["contract", "state", "action", "images", "task"]
 TRAIN_CONFIG_FILE = "train_config.json"
@@ -182,8 +183,10 @@ def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | No
         mean = float(stats[STATE_KEY]["mean"][list(names or ()).index("az_mps2")])
     except (OSError, ValueError, KeyError, IndexError, TypeError):
         return _ASKED_FRAME
+    if (frame := frame_by_gravity(mean)) is None:
+        return _ASKED_FRAME
     why = f"the mean of az_mps2 is {mean:.1f}, by {STATS}"
-    return Entry("contract", "state_frame", frame_by_gravity(mean), why, "guessed")
+    return Entry("contract", "state_frame", frame, why, "guessed")
 
 
 def _width(feature: object) -> int:

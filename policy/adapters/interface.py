@@ -16,12 +16,9 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, ACTION_NAMES, QUATERNION, STATE_NAMES, Contract
 from policy.errors import ContractError, PolicyError
-from policy.files import read_toml
+from policy.files import UNANSWERED, read_toml
 from policy.motion.rotation import matrix_columns
 from policy.preprocess import egocentric_columns
-
-UNANSWERED = "?"
-"""Value in a contract file that the user has to replace."""
 
 ACTION_FIELDS: dict[str, tuple[str, ...]] = {
     "sticks": ACTION_NAMES,

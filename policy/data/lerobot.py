@@ -31,10 +31,18 @@ from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArr
 from policy.data.flight_video import rgb_pixels
 from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
 from policy.errors import ContractError
-from policy.files import CONTRACT_FILE, library_name, read_object, read_toml, why_unreadable
+from policy.files import (
+    CONTRACT_FILE,
+    UNANSWERED,
+    library_name,
+    read_object,
+    read_toml,
+    why_unreadable,
+)
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
 """Path templates: fields with these names, a few digits wide."""
+_UNITS = (("state", "scale"), ("action", "scale"), ("action", "offset"))
 _MAX_EPISODES = 100_000
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
@@ -87,7 +95,9 @@ class _Info:
     camera: str
     is_video: bool
     contract: Contract
-    """With ``STICK_TERMS`` alone."""
+    """With ``STICK_TERMS``, and ``told_frame`` if that is not None."""
+    told_frame: StateFrame | None
+    """State frame by the contract file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +133,7 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
     for key in ("data_path", "video_path"):
         if not _PATH.fullmatch(template := str(data.get(key) or "")):
             raise DatasetError(f"{path} does not say where its files are: {key} {template[:99]!r}")
+    contract, told_frame = _told_contract(folder / CONTRACT_FILE)
     return _Info(
         folder=folder,
         fps=float(fps),
@@ -131,22 +142,32 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
         video_path=str(data.get("video_path") or names.VIDEO),
         camera=camera,
         is_video=features[camera].get("dtype") == "video",
-        contract=_stick_contract(folder / CONTRACT_FILE),
+        contract=contract,
+        told_frame=told_frame,
     )
 
 
-def _stick_contract(path: Path) -> Contract:
-    """Return the defaults with the ``STICK_TERMS`` of a dataset's contract file, if there is one.
+def _told_contract(path: Path) -> tuple[Contract, StateFrame | None]:
+    """Return the defaults with the ``STICK_TERMS`` of a dataset's contract file, if there is one,
+    and the state frame, if the file says it.
 
     An open question among its other entries does not matter.
     """
     try:
-        said = read_toml(path).get("contract", {})
-        return Contract.from_fields({name: said[name] for name in STICK_TERMS if name in said})
+        tables = read_toml(path)
+        said = tables.get("contract", {})
+        if units := [f"[{t}] {n}" for t, n in _UNITS if n in tables.get(t, {})]:
+            raise ContractError(f"{units[0]} is not applied to data: convert the columns instead")
+        told = {name: said[name] for name in STICK_TERMS if name in said}
+        has_frame = said.get(names.STATE_FRAME, UNANSWERED) != UNANSWERED
+        if has_frame:
+            told[names.STATE_FRAME] = said[names.STATE_FRAME]
+        contract = Contract.from_fields(told)
+        return contract, contract.state_frame if has_frame else None
     except FileNotFoundError:
-        return Contract()
-    except (OSError, ValueError, TypeError, ContractError) as error:
-        raise DatasetError(f"{path} does not say what its sticks did: {error}") from error
+        return Contract(), None
+    except (OSError, ValueError, TypeError, AttributeError, ContractError) as error:
+        raise DatasetError(f"{path} does not tell what its numbers mean: {error}") from error
 
 
 def _require_vector(
@@ -306,15 +327,24 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
 
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
-    """Return the noted frame, else tell it by gravity."""
+    """Return the noted frame, or that of the contract file; else tell it by gravity."""
     noted = names.noted_frame(info.features[names.STATE_KEY])
-    if noted in get_args(StateFrame):
-        return cast(StateFrame, noted)
-    if noted is not None:
+    frames = {each for each in (noted, info.told_frame) if each is not None}
+    if len(frames) > 1 or not frames <= set(get_args(StateFrame)):
         raise DatasetError(
-            f"{row.name}: its state frame is {noted!r}; known are {list(get_args(StateFrame))}"
+            f"{row.name}: its state frame is {noted!r}, in {CONTRACT_FILE} {info.told_frame!r}; "
+            f"known are {list(get_args(StateFrame))}"
         )
-    return names.frame_by_gravity(float(np.median(state[:, SPECIFIC_FORCE][:, 2])))
+    if frames:
+        return cast(StateFrame, frames.pop())
+    az_mps2 = float(np.median(state[:, SPECIFIC_FORCE][:, 2]))
+    if (frame := names.frame_by_gravity(az_mps2)) is None:
+        raise DatasetError(
+            f"{row.name}: its az_mps2 is {az_mps2:.1f} in the median; a specific force is -9.8 in "
+            "ned_frd and 9.8 in enu_flu: write which one it is as state_frame under [contract] in "
+            f"{info.folder / CONTRACT_FILE}"
+        )
+    return frame
 
 
 def _decode(info: _Info, row: _Row) -> Iterator[ImageArray]:

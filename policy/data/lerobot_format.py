@@ -35,6 +35,7 @@ neither.
 """
 SENT = "sent"
 """mavbridge's column with the sticks that flew."""
+LEAST_GRAVITY_MPS2 = 5.0
 STATE_FRAME = "state_frame"
 """In the ``info`` of the state's feature: ``Contract.state_frame``."""
 
@@ -53,6 +54,11 @@ def noted_frame(feature: Mapping[str, object]) -> object:
     return about.get(STATE_FRAME) if isinstance(about, dict) else None
 
 
-def frame_by_gravity(az_mps2: float) -> StateFrame:
-    """Tell the frame by the usual force along z: in level flight -z is up in FRD, +z in FLU."""
+def frame_by_gravity(az_mps2: float) -> StateFrame | None:
+    """Tell the frame by the usual force along z: in level flight -z is up in FRD, +z in FLU.
+
+    None: it is no specific force, which includes gravity, or not in m/s^2.
+    """
+    if not abs(az_mps2) > LEAST_GRAVITY_MPS2:
+        return None
     return "ned_frd" if az_mps2 < 0 else "enu_flu"

@@ -110,6 +110,28 @@ def test_the_frame_of_the_state_is_where_gravity_says(tmp_path: Path) -> None:
         read_dataset(tmp_path / "a", "tail")
 
 
+def test_the_frame_that_the_contract_file_says_is_taken(tmp_path: Path) -> None:
+    """A vehicle's acceleration without gravity, or in g, tells no axes."""
+    still = (*LEVEL[:-1], 0.02)
+    dataset = write(tmp_path / "a", state=still)
+    with pytest.raises(DatasetError, match=r"az_mps2 is 0\.0 in the median.*state_frame"):
+        read_dataset(dataset)
+    contract = dataset / "mavbridge.toml"
+    contract.write_text('[contract]\nstate_frame = "?"\n')
+    with pytest.raises(DatasetError, match="az_mps2 is"):
+        read_dataset(dataset)
+    for frame in ("ned_frd", "enu_flu"):
+        contract.write_text(f'[contract]\nstate_frame = "{frame}"\n')
+        assert read_dataset(dataset)[0].contract.state_frame == frame
+    noted = {"info": {"state_frame": "ned_frd"}}
+    _info(lambda info: info["features"]["observation.state"].update(noted))(dataset)
+    with pytest.raises(DatasetError, match=r"frame is 'ned_frd', in mavbridge\.toml 'enu_flu'"):
+        read_dataset(dataset)
+    contract.write_text("[action]\nscale = [0.01, 0.01, 0.01, 0.01]\n")
+    with pytest.raises(DatasetError, match=r"\[action\] scale is not applied to data"):
+        read_dataset(dataset)
+
+
 BEGIN = f"videos/{CAMERA}/from_timestamp"
 Spoil = Callable[[Path], None]
 TWO_CAMERAS = {"observation.images.tail": COLOUR}
