@@ -69,10 +69,13 @@ class _Stream:
         self.is_given_up = is_given_up
 
     def refuse(self, *, is_silent: bool = False) -> None:
-        """Go on to the next option, after silence to REQUEST_DATA_STREAM, if there is one."""
+        """Go on to the next option, after silence to REQUEST_DATA_STREAM, if there is one.
+
+        An optional group is given up, after silence until its rate is looked at.
+        """
         self.attempts = 0
         if not self.group.is_needed:
-            self.settle(is_given_up=True)
+            self.settle(is_given_up=not is_silent)
         elif not is_silent:
             self._at = (self._at + 1) % len(self._options)
             self.is_denied = self._at == 0
@@ -189,6 +192,9 @@ class StreamRequester:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
                 self._pending.refuse(is_silent=True)
+                if not self._pending.group.is_needed:  # the others first
+                    self._streams.remove(self._pending)
+                    self._streams.append(self._pending)
         may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
         open_streams = (s for s in self._streams if not s.is_settled)
         self._pending = next((s for s in open_streams if may_repeat or not s.is_denied), None)
