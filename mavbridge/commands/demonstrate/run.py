@@ -235,6 +235,8 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
 def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
     """Return how a recorded flight differs from the one to fly, in words; empty if it does not."""
     config = spec.config
+    size_px = meta.contract and meta.contract.image_height
+    asked_px = size_px if config.has_student else config.policy.image_size or SIM_CAMERA_PX
     pairs = {
         "source": (meta.source, "dagger" if config.has_student else "demonstration"),
         "course seed": (meta.course_seed, spec.seed),
@@ -243,6 +245,7 @@ def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
         "--speed": (meta.plan.get("speed_mps"), config.speed),
         "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
         "--policy": (meta.policy, config.policy.policy if config.has_student else meta.policy),
+        "network.image_size": (size_px, asked_px),
         "--checkpoint": tuple(
             " ".join(sorted(digest[:8] for digest in files.values())) or "none"
             for files in (meta.policy_files, spec.weights)

@@ -117,6 +117,7 @@ def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
         ({"autopilot": "px4"}, "--autopilot ardupilot, not px4", False),
         ({"speed": 9.0}, r"--speed 6\.0, not 9\.0", True),
         ({"policy": PolicyConfig(checkpoint=SHIPPED, seed=3)}, "--checkpoint none, not ", False),
+        ({"policy": PolicyConfig(image_size=64, seed=3)}, "image_size 48, not 64", True),
     ],
 )
 def test_a_flight_of_other_settings_is_neither_counted_nor_overwritten(
