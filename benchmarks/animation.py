@@ -55,8 +55,7 @@ class FilmedFlight:
         self.heading = np.unwrap(np.arctan2(forward[1], forward[0]))
         self.right = np.stack(right, axis=1)
         self.sent = np.array([row["sent"] for row in rows])
-        contract = flight.meta.contract
-        self.names = NAMES[contract.action if contract else "sticks"]
+        self.names = NAMES[flight.meta.contract.action]
 
 
 class View:

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.provenance import digests, git_revision, versions
-from mavbridge.core.reasons import reason_from_json, reason_to_json
+from mavbridge.core.reasons import reason_from_json
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_files
 from mavbridge.flight.settings import contract_with_ages
@@ -301,11 +301,6 @@ def _outcomes(episodes: Sequence[EpisodeResult]) -> dict[str, int]:
     return dict(Counter(one.outcome for one in episodes).most_common())
 
 
-def _as_json(episode: EpisodeResult) -> dict[str, object]:
-    lost = None if episode.lost is None else reason_to_json(episode.lost)
-    return asdict(replace(episode, lost=None)) | {"lost": lost}
-
-
 def _from_json(document: dict[str, Any]) -> EpisodeResult:
     lost = None if document["lost"] is None else reason_from_json(document["lost"])
     times_s = tuple(document["gate_times_s"])
@@ -320,9 +315,7 @@ def as_document(
     episodes = _results(flown)
     summary: dict[str, object] | None = None
     if episodes:
-        found = summarise(episodes).items()
-        summary = {name: estimate and asdict(estimate) for name, estimate in found}
-        summary["outcomes"] = _outcomes(episodes)
+        summary = {**summarise(episodes), "outcomes": _outcomes(episodes)}
     return {
         "policy": config.policy.policy,
         "engine": _engine(flown),
@@ -333,7 +326,7 @@ def as_document(
         "asked_episodes": config.episodes,
         "flown_by": flown_by,
         "summary": summary,
-        "episodes": [_as_json(one) for one in episodes],
+        "episodes": episodes,
     }
 
 

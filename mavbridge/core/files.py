@@ -5,9 +5,11 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Reason, reason_to_json
 
 
 def require_writable(path: Path | None, flag: str) -> None:
@@ -79,8 +81,18 @@ def write_output(path: Path, text: str, flag: str) -> None:
 
 
 def as_json(document: object) -> str:
-    """Return the text of a JSON file."""
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    """Return the text of a JSON file; dataclasses, reasons and paths may be anywhere in it."""
+    return json.dumps(document, indent=2, allow_nan=False, default=_plain) + "\n"
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Reason):
+        return reason_to_json(value)
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{value!r} has no form in JSON")
 
 
 def write_durably(path: Path, text: str) -> None:

@@ -5,13 +5,13 @@ Arrays are read-only once they are published here.
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.core.reasons import Reason, reason_to_json
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
@@ -190,11 +190,6 @@ class FlightOutcome:
     two."""
     crash: str | None
     """How the vehicle hit something, in words; None: no contact was seen or reported."""
-
-    def to_json(self) -> dict[str, object]:
-        """Return the outcome for JSON, its reason with code, kind, figures and sentence."""
-        reason = None if self.reason is None else reason_to_json(self.reason)
-        return asdict(replace(self, reason=None)) | {"reason": reason}
 
     @property
     def success(self) -> bool | None:

@@ -1,11 +1,11 @@
 """Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.reasons import Reason, reason_to_json
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
@@ -77,8 +77,8 @@ class ReleaseEvent:
 class ObserverDrops:
     """Events that observers missed; None: no such observer."""
 
-    rerun: int | None
-    recorder: int | None
+    rerun: int | None = None
+    recorder: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,6 +122,9 @@ class TimingReport:
             "new attitude to wire": self.state_to_wire_ms,
             "link round trip": self.link.rtt_ms if self.link else None,
         }
+
+
+_NO_OBSERVERS = ObserverDrops()
 
 
 class FlightTiming:
@@ -190,9 +193,9 @@ class FlightTiming:
         mode: Mode,
         engine: str,
         policy: str,
-        autopilot: str | None,
-        link: LinkStats | None,
-        observer_drops: ObserverDrops,
+        autopilot: str | None = None,
+        link: LinkStats | None = None,
+        observer_drops: ObserverDrops = _NO_OBSERVERS,
         outcome: FlightOutcome | None = None,
     ) -> TimingReport:
         """Return the figures so far; exact once the loops have stopped."""
@@ -329,18 +332,9 @@ class _Span:
 
 
 def report_document(report: TimingReport) -> dict[str, object]:
-    """Return the report as a JSON object, with keys in the order of the dataclasses.
-
-    null: not measured.
-    """
-    document = asdict(report)
-    document["releases"] = [
-        {"t_s": release.t_s, "reason": reason_to_json(release.reason)}
-        for release in report.releases
-    ]
-    if report.outcome is not None:
-        document["outcome"] = report.outcome.to_json()
-    if report.link is not None:
-        for key in ("messages_per_s", "saturated"):
-            document["link"][key] = dict(document["link"][key])
+    """Return the report for ``as_json``, with keys in the order of the dataclasses."""
+    document = {field.name: getattr(report, field.name) for field in fields(report)}
+    if (link := report.link) is not None:
+        pairs = {"messages_per_s": dict(link.messages_per_s), "saturated": dict(link.saturated)}
+        document["link"] = asdict(link) | pairs
     return document

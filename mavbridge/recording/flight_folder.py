@@ -44,8 +44,7 @@ class RecordedFlight:
 
     def tick_rows(self) -> Iterator[TickRow]:
         """Return the ticks as records, with the expert's if it is a demonstration."""
-        contract = self.meta.contract
-        return read_ticks(self.ticks, "sticks" if contract is None else contract.action)
+        return read_ticks(self.ticks, self.meta.contract.action)
 
     def frame_rows(self) -> Iterator[FrameRow]:
         """Return the row of each image."""
@@ -75,7 +74,7 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
     meta = read_meta(folder)
     damage: list[str] = []
     ticks = read_table(folder / TICKS, rows.TICKS, damage=damage)
-    known = ("front",) if meta.contract is None else meta.contract.cameras
+    known = meta.contract.cameras
     if camera is not None and camera not in known:
         raise FlightError(f"{folder} has no camera {camera}: it has {', '.join(known)}")
     other = None if camera == known[0] else camera
@@ -94,8 +93,7 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
 def open_cameras(folder: Path) -> list[RecordedFlight]:
     """Call ``open_flight`` for each camera of a flight, in the contract's order."""
     first = open_flight(folder)
-    others = () if first.meta.contract is None else first.meta.contract.cameras[1:]
-    return [first, *(open_flight(folder, name) for name in others)]
+    return [first, *(open_flight(folder, name) for name in first.meta.contract.cameras[1:])]
 
 
 def _frames(

@@ -110,7 +110,7 @@ class FlightWriter:
         self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
     ) -> None:
         tlog = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
-        for name in (None, *(self.meta.contract.cameras[1:] if self.meta.contract else ())):
+        for name in (None, *self.meta.contract.cameras[1:]):
             job = VideoJob(
                 video=self._folder / video_of(name),
                 hz=self.meta.visual_hz,

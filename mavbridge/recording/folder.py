@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -116,7 +116,7 @@ class FlightMeta:
     source_height: int | None = None
     """Height of the incoming frames. An odd last row is cut off, which H.264 cannot have."""
     source_width: int | None = None
-    contract: Contract | None
+    contract: Contract
     course_seed: int | None = None
     seed: int | None = None
     finished: bool = False
@@ -166,7 +166,7 @@ class FlightMeta:
     def keeps_neutral(self) -> bool:
         """True if neutral is due in each pass of the way out; setpoints to PX4 end before it
         does."""
-        is_stick_flight = self.contract is None or self.contract.action == "sticks"
+        is_stick_flight = self.contract.action == "sticks"
         return is_stick_flight or (self.autopilot or "").startswith("ardupilot")
 
     def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
@@ -177,10 +177,7 @@ class FlightMeta:
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
     """Write or replace ``meta.json``; raise OSError if that fails."""
-    document = {"format": FORMAT, "version": VERSION} | asdict(meta)
-    if meta.outcome is not None:
-        document["outcome"] = meta.outcome.to_json()
-    write_durably(folder / META, as_json(document))
+    write_durably(folder / META, as_json({"format": FORMAT, "version": VERSION} | vars(meta)))
 
 
 def read_meta(folder: Path) -> FlightMeta:
@@ -226,8 +223,7 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
     and valid."""
     known = {f.name: document[f.name] for f in fields(FlightMeta) if f.name in document}
     try:
-        if known.get("contract") is not None:
-            known["contract"] = Contract.from_json(json.dumps(known["contract"]))
+        known["contract"] = Contract.from_json(json.dumps(known["contract"]))
         if known.get("outcome") is not None:
             reason = known["outcome"]["reason"]
             # A sentence without a code is not read back, because no decision can be based on it.

@@ -86,7 +86,7 @@ class Recorder(ObserverThread):
             self._flight,
             capacity=CAPACITY,
             image_capacity=IMAGE_CAPACITY,
-            cameras=1 if meta.contract is None else len(meta.contract.cameras),
+            cameras=len(meta.contract.cameras),
         )
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:

@@ -1,11 +1,11 @@
 """``settings.json``: every setting of a recorded flight, so that it can be replayed."""
 
-import json
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.config.flight import FlyConfig
+from mavbridge.core.files import as_json
 from mavbridge.core.provenance import without_secrets
 from mavbridge.recording.folder import SETTINGS, FlightError
 from policy.files import read_json
@@ -24,8 +24,7 @@ class ReplaySettings:
 
 def write_settings(folder: Path, settings: ReplaySettings) -> None:
     """Write the file; raise OSError if that fails."""
-    text = json.dumps(asdict(settings), indent=2, default=str) + "\n"
-    (folder / SETTINGS).write_text(without_secrets(text))
+    (folder / SETTINGS).write_text(without_secrets(as_json(settings)))
 
 
 def read_settings(folder: Path) -> ReplaySettings:

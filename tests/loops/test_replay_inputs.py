@@ -103,7 +103,6 @@ class Flown:
         return ReplaySource(
             folder=Path("in memory"),
             meta=make_meta(contract=runner.contract, mode=mode, autopilot="ardupilot"),
-            contract=runner.contract,
             config=FlyConfig(arm=True, goal=goal),
             ticks=tuple(event for event in self.sink.events if isinstance(event, Tick)),
             solves=tuple(self.solves),
@@ -255,7 +254,6 @@ def test_the_guard_is_repeated_to_the_end_of_a_flight(
     source = ReplaySource(
         folder=Path("in memory"),
         meta=make_meta(contract=flight.scripted.contract, autopilot=autopilot),
-        contract=flight.scripted.contract,
         config=FlyConfig(link=LinkConfig(connect="memory")),
         ticks=tuple(flight.sink.ticks),
         solves=tuple(flight.solves),

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -30,7 +30,7 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.terminal import number
-from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
+from mavbridge.observe.timing import FlightTiming, TimingReport, report_document
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 
@@ -48,37 +48,19 @@ USAGE_NS = NS_PER_S // 4
 """Time between two readings of processor times and temperature."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Computer:
-    """Description of a computer; an empty text is unknown."""
-
-    model: str
-    """Name of the board, as a Raspberry Pi or a Jetson tells it."""
-    cpu: str
-    machine: str
-    """Architecture, as x86_64 or aarch64."""
-    cores: int
-    """Cores that this process may use."""
-    kernel: str
-    governor: str
-    """Governor of the clock of CPU 0."""
-    versions: dict[str, str]
-    """Versions of Python, mavbridge and the packages that compute."""
-
-
-def this_computer() -> Computer:
-    """Describe this computer."""
+def this_computer() -> dict[str, object]:
+    """Describe this computer; an empty text is unknown."""
     lines = _text(PROC / "cpuinfo").splitlines()
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return Computer(
-        model=_text(PROC / "device-tree/model").strip("\0"),
-        cpu=next(names, platform.processor() or "unknown processor"),
-        machine=platform.machine(),
-        cores=usable_cores(),
-        kernel=platform.release(),
-        governor=_text(SYS / _GOVERNOR),
-        versions=versions(),
-    )
+    return {
+        "model": _text(PROC / "device-tree/model").strip("\0"),  # of a Raspberry Pi or a Jetson
+        "cpu": next(names, platform.processor() or "unknown processor"),
+        "machine": platform.machine(),
+        "cores": usable_cores(),
+        "kernel": platform.release(),
+        "governor": _text(SYS / _GOVERNOR),
+        "versions": versions(),
+    }
 
 
 def hottest_c() -> float | None:
@@ -150,7 +132,8 @@ class UsageMeter:
 class Soak:
     """Result of a soak."""
 
-    computer: Computer
+    computer: dict[str, object]
+    """See ``this_computer``."""
     timing: TimingReport
     cpu_cores: dict[str, float]
     """See ``UsageMeter.cores``."""
@@ -159,7 +142,7 @@ class Soak:
 
     def document(self) -> dict[str, object]:
         """Return all figures as a JSON object; ``timing`` is as in a flight's report."""
-        return asdict(self) | {"timing": report_document(self.timing)}
+        return vars(self) | {"timing": report_document(self.timing)}
 
     def row(self) -> CheckRow:
         """Return the row of the check: a warning if a slot was missed or a rate was not held."""
@@ -179,7 +162,7 @@ class Soak:
             "soak",
             f"{sticks.flying_s:.0f} s, {sticks.missed_slots} of {sticks.slots} slots missed; "
             f"chunks {number(action.rate_hz, 1)} Hz, images {number(vision.rate_hz, 1)} Hz, "
-            f"{cores:.2f} of {self.computer.cores} cores{heat}",
+            f"{cores:.2f} of {self.computer['cores']} cores{heat}",
             f"no slot missed, {action.target_hz:g} and {vision.target_hz:g} Hz",
             warn="; ".join(warnings),
         )
@@ -251,9 +234,6 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> So
         mode="dual" if runner.dual_rate else "single",
         engine=runner.engine,
         policy=runner.name,
-        autopilot=None,
-        link=None,
-        observer_drops=ObserverDrops(rerun=None, recorder=None),
     )
     require_whole(report, config.duration or 0.0)
     return Soak(

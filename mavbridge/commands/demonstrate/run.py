@@ -241,7 +241,7 @@ def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
         "source": (meta.source, "dagger" if config.has_student else "demonstration"),
         "course seed": (meta.course_seed, spec.seed),
         "--autopilot": (meta.autopilot, config.autopilot),
-        "--action": (meta.contract and meta.contract.action, config.action),
+        "--action": (meta.contract.action, config.action),
         "--speed": (meta.plan.get("speed_mps"), config.speed),
         "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
         "--policy": (meta.policy, config.policy.policy if config.has_student else meta.policy),

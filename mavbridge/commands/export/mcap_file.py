@@ -27,7 +27,7 @@ from mavbridge.observe.images import as_rgb, jpeg
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
 from mavbridge.recording.folder import META, FlightMeta
 from mavbridge.recording.rows import TickRow
-from policy.contract import QUATERNION, STATE_NAMES, Contract, StateFrame
+from policy.contract import QUATERNION, STATE_NAMES, StateFrame
 from policy.data.flight_folders import find_flights
 from policy.motion.rotation import other_frame
 
@@ -107,7 +107,7 @@ def write_flight(cameras: Sequence[RecordedFlight], path: Path) -> int:
         OSError: the file cannot be written.
     """
     flight = cameras[0]
-    contract = flight.meta.contract or Contract()
+    contract = flight.meta.contract
     offset_ns, known = unix_offset_ns(flight.meta), schemas(contract.action)
     videos = zip(contract.cameras, cameras, strict=True)
     streams = [_ticks(flight, contract.state_frame), *(_images(*each) for each in videos)]

@@ -192,8 +192,6 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
 
 def _require_same_kind(flight: RecordedFlight, config: WorldModelConfig) -> None:
     what, contract = f"--start {flight.folder}", flight.meta.contract
-    if contract is None:
-        raise UserError(f"{what} has its states in an unknown frame: name another flight")
     if contract.action != "sticks":
         raise UserError(f"{what} was flown by {contract.action}, the world model takes sticks")
     require_terms(config.contract, contract, what)

@@ -141,8 +141,8 @@ class FlightAnalysis:
     """Missed slots and late chunks in the order of time, each with its cause."""
     moments: tuple[Moment, ...]
     """The ten worst, starting with the worst."""
-    limits: FreshnessLimits | None
-    """Maximum ages when a stick is sent; None: unknown."""
+    limits: FreshnessLimits
+    """Maximum ages when a stick is sent."""
     damage: tuple[str, ...]
     """Skipped parts of the recording, in sentences for the user."""
 
@@ -187,8 +187,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     flight, *others = open_cameras(folder)
     _require_sound(flight)
     contract = flight.meta.contract
-    names = ("front",) if contract is None else contract.cameras
-    cameras = dict(zip(names, (flight, *others), strict=True))
+    cameras = dict(zip(contract.cameras, (flight, *others), strict=True))
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
     damage = [text for camera in cameras.values() for text in camera.damage]
@@ -252,8 +251,7 @@ def _report(
         engine=meta.engine or "an engine that is not known",
         policy=meta.policy or meta.source,
         autopilot=meta.autopilot,
-        link=None,
-        observer_drops=ObserverDrops(rerun=None, recorder=_losses(flight)),
+        observer_drops=ObserverDrops(recorder=_losses(flight)),
         outcome=meta.outcome,
     )
     return replace(report, vision=_vision(frames, meta.visual_hz))
@@ -326,10 +324,8 @@ def _track(ticks: Sequence[Tick], frames: Sequence[FrameRow], start_ns: int) -> 
     return Track(t_s=t_s, position_ned_m=np.array(positions))
 
 
-def _flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
+def _flown_limits(folder: Path, contract: Contract) -> FreshnessLimits:
     """Return the age limits when a stick is sent: the recorded flags', else the contract's."""
-    if contract is None:
-        return None
     try:
         limits = effective_freshness(contract, read_settings(folder).config.limits)
     except MavbridgeError:  # no settings, or those of another version
@@ -355,10 +351,9 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
 def recorded_solves(flight: RecordedFlight) -> Iterator[Solve]:
     """Return the policy's solves in the order of time; nothing if they were not recorded."""
-    contract, stem = flight.meta.contract, flight.folder / SOLVES
-    if contract is not None and table_exists(stem):
+    if table_exists(stem := flight.folder / SOLVES):
         table = read_table(stem, replay_tables.SOLVES)
-        yield from replay_tables.read_solves(table, contract)
+        yield from replay_tables.read_solves(table, flight.meta.contract)
 
 
 def flight_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:

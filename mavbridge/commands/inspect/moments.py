@@ -193,11 +193,11 @@ def worst_moments(
     ticks: Sequence[Tick],
     frames: Sequence[FrameRow],
     delays: Sequence[Moment],
-    limits: FreshnessLimits | None = None,
+    limits: FreshnessLimits,
 ) -> tuple[Moment, ...]:
     """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
 
-    ``limits`` are the age limits of the flown chunks; None: unknown.
+    ``limits`` are the age limits of the flown chunks.
     """
     if not ticks:
         return ()
@@ -259,7 +259,7 @@ def _ages(tick: Tick) -> str:
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 
-def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[Moment]:
+def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits) -> Iterator[Moment]:
     """Yield sends of an outdated chunk, up to the first send of a fresh one."""
     at = 0
     for is_coasting, group in groupby(ticks, lambda tick: tick.is_coasting and bool(tick.trace)):
@@ -272,10 +272,10 @@ def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator
             yield Moment(_t_s(ticks, run[0].woke_ns), "coasting", lasted_ms, detail)
 
 
-def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
+def _staleness(tick: Tick, limits: FreshnessLimits) -> str:
     """Return why the chunk of a tick was outdated; in the order of the guard's own check."""
     state = tick.state
-    if limits is not None and state is not None:
+    if state is not None:
         ages = (
             ("attitude", state.attitude_ns, limits.state_ns),
             ("velocity", state.velocity_ns, limits.velocity_ns),

@@ -106,10 +106,10 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
 def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
     """Yield the plots of all N ticks, in NED and FRD for any policy; NaN for missing values."""
     contract = flight.meta.contract
-    yield from _action_plots(flight.ticks, "sticks" if contract is None else contract.action)
+    yield from _action_plots(flight.ticks, contract.action)
     yield from _timing_plots(flight)
     state = _vectors(flight.ticks["state"])
-    if contract is not None and contract.state_frame == "enu_flu":
+    if contract.state_frame == "enu_flu":
         state = other_frame(state)
     angles_rad = np.stack(state_values(list(state.T), STATE_NAMES, EULER_NAMES), axis=-1)
     for title, unit, names, values in (
@@ -148,12 +148,10 @@ def _timing_plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
         "feature": before_send_ms("feature_captured_ns"),
         "attitude": before_send_ms("attitude_ns"),
     }
-    limits_ms: dict[str, float] = {}
-    if limits is not None:
-        limits_ms = {
-            "feature limit": limits.feature_ns / NS_PER_MS,
-            "attitude limit": limits.state_ns / NS_PER_MS,
-        }
+    limits_ms = {
+        "feature limit": limits.feature_ns / NS_PER_MS,
+        "attitude limit": limits.state_ns / NS_PER_MS,
+    }
     yield _plot("Age when sent", "ms", ages, limits_ms) | {"fromZero": True}
     lateness_ms = np.maximum(before_send_ms("due_ns", is_slot), 0.0)
     if np.nanmax(lateness_ms, initial=0.0) > 0:  # none in simulated time
@@ -213,7 +211,7 @@ def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
     if not len(exposed_ns):
         return None
     name, size = video.name, video.stat().st_size
-    if contract is not None and contract.is_depth:
+    if contract.is_depth:
         return {"note": f"{name} holds depth, which browsers do not play: see it by --rerun"}
     if size > MAX_VIDEO_BYTES:
         told = f"{name} has {size / 1e6:.0f} MB, too much for a page"

@@ -3,7 +3,6 @@
 import heapq
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +23,6 @@ from mavbridge.commands.output import print_status, table_console, write_json
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
@@ -34,7 +32,6 @@ from mavbridge.observe.viewer import RerunView
 from mavbridge.observe.viewer_layout import ViewedFlight
 from mavbridge.observe.viewer_target import check_target
 from mavbridge.recording.flight_folder import RecordedFlight
-from policy.contract import Contract
 
 HOLDERS_SHOWN = 12
 NOTABLE = 0.1
@@ -242,23 +239,16 @@ def as_document(flight: FlightAnalysis) -> dict[str, object]:
         "damage": flight.damage,
         "stick_hz": flight.stick_hz,
         "report": report_document(flight.report),
-        "image_latency_ms": {
-            camera: latency and asdict(latency)
-            for camera, latency in flight.image_latency_ms.items()
-        },
+        "image_latency_ms": flight.image_latency_ms,
         "causes": dict(flight.causes),
-        "holders": [
-            asdict(span) | {"reason": span.reason and reason_to_json(span.reason)}
-            for span in flight.holders
-        ],
-        "moments": [asdict(moment) for moment in flight.moments],
+        "holders": flight.holders,
+        "moments": flight.moments,
     }
 
 
 def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
     """Send the whole recording to the viewer for live flights."""
-    meta, contract = flight.meta, flight.meta.contract or Contract()
-    limits = flight.limits
+    meta, contract, limits = flight.meta, flight.meta.contract, flight.limits
     view = RerunView(
         target,
         ViewedFlight(
@@ -266,8 +256,8 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             chunk_hz=meta.action_hz,
             stick_hz=flight.stick_hz,
             contract=contract,
-            max_state_age_s=None if limits is None else limits.state_ns / NS_PER_S,
-            max_feature_age_s=None if limits is None else limits.feature_ns / NS_PER_S,
+            max_state_age_s=limits.state_ns / NS_PER_S,
+            max_feature_age_s=limits.feature_ns / NS_PER_S,
             to_ned=action_frame(contract).to_guard,
             gates=flight.gates,
         ),

@@ -58,7 +58,6 @@ class ReplaySource:
 
     folder: Path
     meta: FlightMeta
-    contract: Contract
     config: FlyConfig
     """Flags of the flight, without those that act outside it, such as ``--set`` and
     ``--record``."""
@@ -73,6 +72,11 @@ class ReplaySource:
     gaps: tuple[str, ...]
     """Losses of the recording, in words; the replay may differ there."""
 
+    @property
+    def contract(self) -> Contract:
+        """Contract of the policy that flew."""
+        return self.meta.contract
+
 
 def open_source(folder: Path) -> ReplaySource:
     """Read a flight, finished or cut off.
@@ -81,11 +85,9 @@ def open_source(folder: Path) -> ReplaySource:
         MavbridgeError: not a recorded flight, or one that cannot be replayed.
     """
     meta, settings = read_meta(folder), read_settings(folder)
-    if meta.contract is None:
-        raise UserError(f"{folder} was flown without a policy: there is nothing to replay")
     flown = settings.config
     damage: list[str] = []
-    ticks, solves, solves_lost = _rows(folder, meta, meta.contract, damage)
+    ticks, solves, solves_lost = _rows(folder, meta, damage)
     stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
     log, skipped = read_tlog(folder / TLOG)
     if skipped:
@@ -105,7 +107,6 @@ def open_source(folder: Path) -> ReplaySource:
     return ReplaySource(
         folder=folder,
         meta=meta,
-        contract=meta.contract,
         config=replace(
             flown,
             link=replace(flown.link, set=()),
@@ -126,13 +127,13 @@ def open_source(folder: Path) -> ReplaySource:
 
 
 def _rows(
-    folder: Path, meta: FlightMeta, contract: Contract, damage: list[str]
+    folder: Path, meta: FlightMeta, damage: list[str]
 ) -> tuple[list[TickRow], list[Solve], int]:
     """Read ticks, solves and the number of lost solves; raise UserError without ticks or solves."""
     table = read_table(folder / TICKS, rows.TICKS, damage=damage)
-    ticks = list(rows.read_ticks(table, contract.action))
+    ticks = list(rows.read_ticks(table, meta.contract.action))
     table = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
-    solves = list(read_solves(table, contract))
+    solves = list(read_solves(table, meta.contract))
     if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
         solves = [solve for solve in solves if solve.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solves:
@@ -151,7 +152,7 @@ def _lost(**counts: int) -> Iterator[str]:
 def _features(
     folder: Path, meta: FlightMeta, damage: list[str]
 ) -> tuple[tuple[FeatureFrame, ...], ...]:
-    if meta.mode != "dual" or meta.contract is None:
+    if meta.mode != "dual":
         return ()
     tables = [
         read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)

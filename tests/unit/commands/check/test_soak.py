@@ -27,7 +27,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
-from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
+from mavbridge.observe.timing import FlightTiming, TimingReport
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -47,9 +47,7 @@ def report_of(*ticks: Tick) -> TimingReport:
     timing = FlightTiming(stick_hz=100.0, action_hz=100.0, vision_hz=30.0)
     for tick in ticks:
         timing.emit(tick)
-    facts = {"engine": "numpy", "policy": "mine", "autopilot": None, "link": None}
-    drops = ObserverDrops(rerun=None, recorder=None)
-    return timing.report(mode="dual", observer_drops=drops, **facts)  # type: ignore[arg-type]
+    return timing.report(mode="dual", engine="numpy", policy="mine")
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
@@ -106,7 +104,7 @@ def test_a_row_warns_of_missed_slots_and_of_rates_that_are_not_held() -> None:
     meter.emit(FLOWN[-1])
     assert 0 < meter.cores["flight"] < 1
     assert "flight/MainThread" in meter.cores
-    computer = replace(this_computer(), cores=2)
+    computer = this_computer() | {"cores": 2}
     measured = Soak(computer=computer, timing=report, cpu_cores=meter.cores, hottest_c=71.4)
     row = measured.row()
     assert row.verdict == "warn"
@@ -124,7 +122,7 @@ def test_figures_of_the_computer_are_the_kernels(
     monkeypatch.setattr(soak, "PROC", tmp_path)
     monkeypatch.setattr(soak, "SYS", tmp_path)
     assert used_ns(7)["guard"] == 0
-    assert (hottest_c(), this_computer().model) == (None, "")
+    assert (hottest_c(), this_computer()["model"]) == (None, "")
     files = {
         "7/schedstat": "5000000 3000000 12\n",
         "cpuinfo": "processor\t: 0\nmodel name\t: Some CPU\n",
@@ -139,4 +137,4 @@ def test_figures_of_the_computer_are_the_kernels(
         path.write_text(text)
     assert used_ns(7)["guard"] == 5 * NS_PER_MS
     here = this_computer()
-    assert (here.model, here.cpu, hottest_c()) == ("Raspberry Pi 5", "Some CPU", 61.0)
+    assert (here["model"], here["cpu"], hottest_c()) == ("Raspberry Pi 5", "Some CPU", 61.0)

@@ -52,9 +52,9 @@ def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight:
 
 def test_a_flight_without_states_frames_or_known_axes_is_refused(tmp_path: Path) -> None:
     blind = open_flight(write_flight(tmp_path / "a", frames=False))
-    axes = replace(blind, meta=replace(blind.meta, contract=None))
+    axes = replace(blind, meta=replace(blind.meta, contract=Contract(state_frame="enu_flu")))
     silent = open_flight(write_flight(tmp_path / "b", ticks=False))
-    for flight, told in ((silent, "no state"), (blind, "no frames"), (axes, "unknown frame")):
+    for flight, told in ((silent, "no state"), (blind, "no frames"), (axes, "has enu_flu")):
         with pytest.raises(UserError, match=told):
             read_start(flight, TINY, 0.0)
 
