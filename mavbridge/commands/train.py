@@ -127,12 +127,14 @@ def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightDa
     console = text_console(stderr=True)
     if note is not None:
         console.print(note, soft_wrap=True)
-    flights, left_out = read_flights(folders, camera_key)
+    flights, warnings = read_flights(folders, camera_key)
     several = [flight for flight in flights if len(flight.contract.cameras) > 1]
     if several and camera_key is None:
         name, cameras = several[0].name, list(several[0].contract.cameras)
         raise UserError(f"{name}: several cameras {cameras}: name one by --camera-key")
     if camera_key is not None and not (several or datasets):
         raise UserError("--camera-key names one of several cameras; these flights have one")
-    print_warnings(console, left_out + [text for flight in flights for text in flight.damage])
+    if len(names := {flight.contract.cameras[0] for flight in flights}) > 1 and not several:
+        warnings.append(f"cameras {', '.join(sorted(names))} are taken for one and the same")
+    print_warnings(console, warnings + [text for flight in flights for text in flight.damage])
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

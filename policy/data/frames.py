@@ -1,7 +1,7 @@
 """Images of all flights, decoded once, as arrays on disk."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import cv2
@@ -18,8 +18,10 @@ _SPARE_BYTES = 1 << 30
 class FrameStore:
     """Images of flights [N, height, width, 3] uint8, numbered across all flights in order."""
 
-    def __init__(self, arrays: Sequence[ImageArray]) -> None:
+    def __init__(self, arrays: Sequence[ImageArray], proportions: Collection[float] = ()) -> None:
         self._arrays = arrays
+        self.proportions = sorted(proportions)
+        """Width by height of the images before they were made square, each once."""
         self.counts = [len(array) for array in arrays]
         """Number of images of each flight."""
         self._starts = np.cumsum([0, *self.counts])
@@ -79,12 +81,13 @@ def store_frames(
             f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
             "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
         )
-    arrays = []
+    arrays, proportions = [], set[float]()
     for index, flight in enumerate(flights):
         path = folder / f"{index}.rgb"
         with path.open("wb") as file:  # not memory-mapped: a full disk under a map kills a process
             for image in flight.decode():
+                proportions.add(round(image.shape[1] / image.shape[0], 2))
                 file.write(np.ascontiguousarray(resize(image, size, size)).data)
         arrays.append(np.memmap(path, np.uint8, mode="r").reshape(-1, size, size, 3))
         progress((index + 1) / len(flights))
-    return FrameStore(arrays)
+    return FrameStore(arrays, proportions)

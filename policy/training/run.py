@@ -110,6 +110,12 @@ class TrainingRun(ABC, Generic[M, B]):
             settings.image_size,
             progress=lambda done: self.report_work(f"decoding, {done:.0%}"),
         )
+        if len(shapes := self.store.proportions) > 1:
+            told = ", ".join(f"{each:g}" for each in shapes)
+            self.note(
+                f"the images have different proportions (width by height {told}) and are all made "
+                "square, so that one thing has several shapes: train on one camera's flights"
+            )
         self._begun_s = hooks.now_s()
 
     # ---- for subclasses ----

@@ -1,7 +1,8 @@
 """``mavbridge train`` and ``train-world-model``, from the command line to the checkpoint."""
 
 import signal
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.networks import load_world_model
 from policy.contract import Contract
 from policy.data.flight_data import FlightData
-from policy.data.flight_folders import read_flight
+from policy.data.flight_folders import read_flight, read_flights
 from policy.loading.builtin import SHIPPED
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
@@ -62,19 +63,27 @@ def test_a_world_model_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert model.config.contract == flown
 
 
+def test_cameras_of_different_names_are_told(tmp_path: Path) -> None:
+    write_spot_flight(tmp_path / "flights" / "a", 0, seconds=0.5)
+    down = write_spot_flight(tmp_path / "flights" / "b", 1, seconds=0.5)
+    write_meta(down, contract=asdict(Contract(cameras=("down",))))
+    out = ("--out", tmp_path / "a.safetensors")
+    status, text = told_by("train", tmp_path / "flights", *out, *SMALL, "--steps", "1")
+    assert (status, "cameras down, front are taken for one" in text) == (0, True)
+
+
 def test_the_end_is_not_learned_from_flights_without_gates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flights, out = tmp_path / "flights", tmp_path / "a.safetensors"
-    for name in ("blind", "sighted"):
-        write_spot_flight(flights / name, 0, seconds=0.3)
+    for seed, name in enumerate(("blind", "sighted")):
+        write_spot_flight(flights / name, seed, seconds=0.3)
 
-    def read(folder: Path, camera: str | None) -> FlightData:
-        flight = read_flight(folder, camera)
-        unknown = np.full_like(flight.gate, np.nan)
-        return replace(flight, gate=unknown) if folder.name == "blind" else flight
+    def read(folders: Sequence[Path], camera: str | None) -> tuple[list[FlightData], list[str]]:
+        (blind, sighted), left_out = read_flights(folders, camera)
+        return [replace(blind, gate=np.full_like(blind.gate, np.nan)), sighted], left_out
 
-    monkeypatch.setattr(run, "read_flight", read)
+    monkeypatch.setattr(run, "read_flights", read)
     start = ("--start-from", SHIPPED, "--only-end")
     status, text = told_by("train", flights, "--out", out, *start, *SMALL)
     assert status == 2

@@ -126,6 +126,18 @@ def test_a_flight_of_no_use_is_left_out_whether_or_not_it_would_be_held_out(flig
         run([blind], asked)
 
 
+def test_images_of_several_proportions_are_told(flights, tmp_path):
+    wide = np.zeros((18, 32, 3), np.uint8)
+    other = replace(flights[0], decode=lambda: (wide for _ in flights[0].captured_ns))
+    notes: list[str | None] = []
+    asked = settings(tmp_path, steps=1, validations=1)
+    run([other, flights[1]], asked, lambda progress: notes.append(progress.note))
+    assert any(note is not None and "(width by height 1, 1.78)" in note for note in notes)
+    notes.clear()
+    run([other], asked, lambda progress: notes.append(progress.note))
+    assert not any(note is not None and "width by height" in note for note in notes)
+
+
 def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
     network = ResnetUnetConfig(contract=CONTRACT)
     changes = {"gate_weight": 0.0, "mirror": False, "validations": 1, "steps": 2, "pack": True}
