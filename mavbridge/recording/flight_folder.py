@@ -73,7 +73,7 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
     """
     meta = read_meta(folder)
     damage: list[str] = []
-    ticks = read_table(folder / TICKS, rows.TICKS, damage=damage)
+    ticks = read_table(folder / TICKS, rows.TICKS, optional=rows.DEMONSTRATION_TICKS, damage=damage)
     known = meta.contract.cameras
     if camera is not None and camera not in known:
         raise FlightError(f"{folder} has no camera {camera}: it has {', '.join(known)}")
@@ -110,7 +110,9 @@ def _frames(
                 "folder again, whole"
             )
         return rows.FRAMES.empty_table(), ()  # the flight ended before its first frame
-    table, numbers = read_numbered(folder / stem, rows.FRAMES, damage=damage)
+    table, numbers = read_numbered(
+        folder / stem, rows.FRAMES, optional=rows.DEMONSTRATION_FRAMES, damage=damage
+    )
     try:
         places, more = with_images(folder / video, numbers, is_whole=meta.finished)
     except OSError as error:

@@ -64,6 +64,7 @@ _STICKS = pa.list_(pa.float32(), ACTION_DIM)
 _VECTOR = pa.list_(pa.float32(), 3)
 STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
 _TRUTH = tuple(field.name for field in fields(FrameTruth))
+_POSE = _TRUTH[:3]
 
 
 def columns(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
@@ -107,7 +108,7 @@ DEMONSTRATION_FRAMES = pa.schema(
         pa.field("gate_after_body_m", _VECTOR),
     ]
 )
-"""Columns with the truth: all null if it was not given; otherwise its position is never null."""
+"""Columns with the truth: all null if it was not given; otherwise its pose is never null."""
 
 _TICK = tuple(
     field.name
@@ -174,8 +175,8 @@ def read_frames(table: pa.Table) -> Iterator[FrameRow]:
     """Return the records of a table of frames."""
     for row in table_rows(table):
         truth = None
-        if row.get("position_ned_m") is not None:
-            values: dict[str, Any] = {name: row[name] for name in _TRUTH}
+        if all(row.get(name) is not None for name in _POSE):
+            values: dict[str, Any] = {name: row.get(name) for name in _TRUTH}
             lists = {name: tuple(v) for name, v in values.items() if isinstance(v, list)}
             truth = FrameTruth(**(values | lists))
         yield FrameRow(**{name: row[name] for name in FRAMES.names}, truth=truth)

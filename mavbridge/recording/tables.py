@@ -93,15 +93,22 @@ class TableWriter:
         self._sink.close()
 
 
-def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
+def read_table(
+    stem: Path,
+    schema: pa.Schema,
+    *,
+    optional: Iterable[pa.Field] = (),
+    damage: list[str] | None = None,
+) -> pa.Table:
     """Read the table with this stem in either format; of a cut-off stream, the complete batches.
 
     A sentence about any loss is appended to ``damage``. ``dropped_before`` includes damaged rows.
+    Columns of ``optional`` may be absent.
 
     Raises:
         DatasetError: the table is missing or damaged, or lacks a column of ``schema``.
     """
-    return count_lost(*read_numbered(stem, schema, damage=damage))
+    return count_lost(*read_numbered(stem, schema, optional=optional, damage=damage))
 
 
 def count_lost(table: pa.Table, numbers: NDArray[np.int64]) -> pa.Table:
@@ -134,15 +141,20 @@ def table_exists(stem: Path) -> bool:
 
 
 def read_numbered(
-    stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
+    stem: Path,
+    schema: pa.Schema,
+    *,
+    optional: Iterable[pa.Field] = (),
+    damage: list[str] | None = None,
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read the table as ``read_table`` does, with the row numbers from before any loss."""
     table, numbers = read_rows(stem, [] if damage is None else damage, schema.names)
     if not table.column_names:
         table = schema.empty_table()
+    known = [*schema, *(each for each in optional if each.name in table.column_names)]
     missing = [
         field.name
-        for field in schema
+        for field in known
         if field.name not in table.column_names or table.schema.field(field.name).type != field.type
     ]
     if missing:
@@ -150,7 +162,7 @@ def read_numbered(
             f"the table {stem} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
             f"of docs/formats.md: {_ADVICE}"
         )
-    for field in schema:
+    for field in known:
         column = table[field.name]
         is_list = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
         nulls = pc.list_flatten(column).null_count if is_list else 0

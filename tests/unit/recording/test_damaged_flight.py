@@ -20,6 +20,7 @@ from policy.data.flight_folders import read_flight
 from policy.data.flight_video import video_parts
 
 TICKS, FRAMES = 6000, 90
+START = Path(__file__).parents[3] / "examples/start"
 fly_tick = partial(make_tick, phase="flying")
 
 
@@ -126,3 +127,21 @@ def test_a_value_that_every_row_has_is_missed(flight: Path, column: str, said: s
     pq.write_table(table.set_column(place, column, values), flight / "ticks.parquet")
     with pytest.raises((DatasetError, FlightError), match=said):
         inspect((flight,), InspectConfig())
+
+
+def test_the_truth_of_a_frame_is_whole_or_absent_and_of_its_type(tmp_path: Path) -> None:
+    shutil.copytree(START, folder := tmp_path / "a")
+    path = folder / "frames.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.drop_columns(["next_gate"]), path)
+    first = next(open_flight(folder).frame_rows()).truth
+    assert first is not None
+    assert first.next_gate is None
+    for name in ("position_ned_m", "ned_from_body_wxyz"):
+        place, kind = table.column_names.index(name), table.schema.field(name).type
+        pq.write_table(table.set_column(place, name, pa.nulls(table.num_rows, kind)), path)
+        assert {row.truth for row in open_flight(folder).frame_rows()} == {None}
+        words = pa.array(["north"] * table.num_rows)
+        pq.write_table(table.set_column(place, name, words), path)
+        with pytest.raises(DatasetError, match=rf"lacks the column {name} of docs/formats\.md"):
+            open_flight(folder)
