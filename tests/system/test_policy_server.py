@@ -234,9 +234,16 @@ def test_a_server_may_say_fields_that_the_file_lacks(
         with closing(policy):
             assert (policy.contract.horizon, predict(policy)) == (4, 0.5)
         both = 'cameras = ["front", "down"]\n[images]\nfront = "image"\ndown = "image"\n'
-        contract_file.write_text(CONTRACT + both)
-        with pytest.raises(PolicyError, match="one key to several cameras: image, image"):
-            load_server_policy(url, contract_file)
+        of_state = '[images]\nfront = "observation"\n[state]\nkey = "observation"\n'
+        of_prompt = '[state]\nkey = "prompt"\n[task]\nprompt = "fly"\n'
+        for more, keys in (
+            (both, "image, image"),
+            (of_state, "observation"),
+            (of_prompt, "prompt"),
+        ):
+            contract_file.write_text(CONTRACT + more)
+            with pytest.raises(PolicyError, match=f"several inputs would have one key: .*{keys}"):
+                load_server_policy(url, contract_file)
 
 
 def test_addresses_without_a_policy_server(

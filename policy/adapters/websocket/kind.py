@@ -56,8 +56,9 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
     try:
         metadata = link.connect()
         interface = _interface(contract_file, metadata)
-        if len(set(keys := interface.camera_keys)) < len(keys):
-            raise ContractError(f"[images] gives one key to several cameras: {', '.join(keys)}")
+        keys = [*interface.camera_keys, interface.state_key, *["prompt"] * bool(interface.prompt)]
+        if len(set(keys)) < len(keys):
+            raise ContractError(f"several inputs would have one key: {', '.join(keys)}")
         policy = RemotePolicy(link, interface, is_ours=CONTRACT_KEY in metadata)
         return policy, [policy.try_out()]
     except PolicyError as error:
