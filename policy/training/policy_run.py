@@ -12,7 +12,7 @@ from torch.optim.swa_utils import update_bn
 
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import FLIGHT_TERMS
-from policy.data.flight_data import FlightData, Nanoseconds
+from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
@@ -173,17 +173,19 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
     """Return sorted image ages to train for: measured ones, or a uniform range.
 
-    If no policy flew, as in a human pilot's flights, the usual range.
+    If no policy flew, as in a human pilot's flights, the usual range. An image that stayed for
+    seconds, as of a camera that paused, is not flown by.
     """
     if settings.age_range_ms is not None:
         return _evenly(settings.age_range_ms)
     if settings.ages is not None:
-        return read_ages(Path(settings.ages))
-    ages = np.concatenate([flight.age_ns for flight in flights])
-    ages = np.sort(ages[(ages > 0) & (ages <= MAX_AGE_MS * NS_PER_MS)])
-    if len(ages) == 0:
-        return _evenly(USUAL_AGES_MS)
-    return ages
+        ages = read_ages(Path(settings.ages))
+    else:
+        ages = np.concatenate([flight.age_ns for flight in flights])
+    usable = np.sort(ages[(ages > 0) & (ages <= MAX_AGE_MS * NS_PER_MS)])
+    if len(usable) == 0 and settings.ages is not None:
+        raise DatasetError(f"--ages {settings.ages}: each image in it was over {MAX_AGE_MS} ms old")
+    return usable if len(usable) else _evenly(USUAL_AGES_MS)
 
 
 def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from helpers.flight_folders import write_spot_flight
+from helpers.flight_folders import MS, spot, ticks_table, write_flight, write_spot_flight
 from helpers.training_runs import make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
@@ -124,6 +124,23 @@ def test_a_flight_of_no_use_is_left_out_whether_or_not_it_would_be_held_out(flig
     assert any(note is not None and "left out: blind: none of 18 images" in note for note in notes)
     with pytest.raises(DatasetError, match="blind: none of 18 images"):
         run([blind], asked)
+
+
+def test_ages_of_a_camera_that_paused_are_not_learned(flights, tmp_path):
+    """Measured on this computer, where the camera stopped for seconds: nothing flies by those."""
+    woke = [10**9 + 10 * MS * k for k in range(600)]
+    seen = [woke[k] - 40 * MS if k < 100 else woke[99] for k in range(600)]
+    table = ticks_table(woke_ns=woke, expert=None, sent=[None] * 600, captured_ns=seen)
+    measured = write_flight(tmp_path / "ages", table, captured_ns=[10**9], images=[spot(32, 0.0)])
+    asked = settings(tmp_path, steps=1, validations=1, ages=str(measured))
+    run(flights, asked)
+    with safe_open(asked.out, framework="pt") as file:
+        card = json.loads(file.metadata()[TRAINING_KEY])
+    assert card["feature_ages_ms"] == [10.0, 1000.0]
+    table = ticks_table(woke_ns=woke, expert=None, sent=[None] * 600, captured_ns=[-(10**9)] * 600)
+    write_flight(tmp_path / "old", table, captured_ns=[10**9], images=[spot(32, 0.0)])
+    with pytest.raises(DatasetError, match="each image in it was over 1000 ms old"):
+        run(flights, replace(asked, ages=str(tmp_path / "old")))
 
 
 def test_images_of_several_proportions_are_told(flights, tmp_path):
