@@ -34,7 +34,7 @@ KEY_BYTES = 32
 EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
 """Unix time of the epoch of MAVLink 2 signing timestamps."""
 RECEIVERS = {"idle": IDLE_RECEIVER_US, "mid": MID_RECEIVER_US, "none": None}
-LEAST_PRIORITY = 19
+LOW_PRIORITY = 5
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
 
 
@@ -277,7 +277,7 @@ def _fly(args: argparse.Namespace) -> None:
             end_ns = None if is_endless else clock.now_ns() + round(args.duration * NS_PER_S)
             fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
         if args.fly_on:
-            os.nice(LEAST_PRIORITY)
+            os.nice(LOW_PRIORITY)
             with stop_on_signal() as stop:  # the signal that ended the flight does not count
                 fly_on(vehicle, args.fly_on, stop)
         if args.report is not None:

@@ -20,13 +20,16 @@ SETTLE_S = 1.0
 """Time after the last step in which nothing must come back."""
 END_S = 20.0
 FLY_ON_S = 10.0
-"""Time of the vehicle's own flight after the end, by which the end is judged."""
+"""Time of the vehicle's own flight after the end, by which the end is judged, and of the guard's
+hold before a pilot takes over."""
 MOST_STALL_MS = 30.0
 """A longer stall of the computer during a run invalidates the run's times."""
 RUNS = 3
 
 
-def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0) -> Verdict:
+def fly_scenario(
+    scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0, fly_on_s: float = FLY_ON_S
+) -> Verdict:
     """Fly and judge a scenario; up to ``RUNS`` times if the computer stalls meanwhile.
 
     ``slack_ms`` is added to the limits, for a computer shared with others.
@@ -35,7 +38,7 @@ def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0)
         verdict = Verdict(scenario=scenario.name, variant=variant, runs=run)
         with tempfile.TemporaryDirectory(prefix="faults-") as name, StallWatch() as stalls:
             try:
-                _fly_once(scenario, verdict, Path(name), slack_ms)
+                _fly_once(scenario, verdict, Path(name), slack_ms, fly_on_s)
             except (StageError, NoVerdictError) as error:
                 verdict.late.append(str(error))
             verdict.stall_ms = max(verdict.stall_ms, stalls.longest_ms)
@@ -44,10 +47,12 @@ def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0)
     return verdict
 
 
-def _fly_once(scenario: Scenario, verdict: Verdict, folder: Path, slack_ms: float) -> None:
+def _fly_once(
+    scenario: Scenario, verdict: Verdict, folder: Path, slack_ms: float, fly_on_s: float
+) -> None:
     variant, threads = verdict.variant, thread_names()
     vehicle = ["--autopilot", variant.autopilot, "--receiver", variant.receiver]
-    vehicle += ["--fly-on", f"{FLY_ON_S:g}"]
+    vehicle += ["--fly-on", f"{fly_on_s:g}"]
     transmitter = Transmitter(variant.receiver) if scenario.transmitter else None
     if transmitter is not None:
         vehicle += transmitter.flags
@@ -65,7 +70,7 @@ def _fly_once(scenario: Scenario, verdict: Verdict, folder: Path, slack_ms: floa
         if scenario.outcome != "refused":
             at_ns = _perform(scenario, stage)
             leans = stage.relay.is_leaning(1)
-            _end(scenario, stage, verdict)
+            _end(scenario, stage, verdict, fly_on_s)
         elif scenario.steps:
             _perform(scenario, stage)
             stage.kill_group(signal.SIGINT)
@@ -112,15 +117,14 @@ def _perform(scenario: Scenario, stage: Stage) -> int:
     return next((moment for moment in moments if moment is not None), 0)
 
 
-def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:
+def _end(scenario: Scenario, stage: Stage, verdict: Verdict, hold_s: float) -> None:
     """End everything; take over from a guard that holds the vehicle for lack of a receiver."""
     guard = stage.guard
     stage.kill_group(signal.SIGCONT)
     verdict.ended_ns = stage.kill_group(signal.SIGINT)
     if -signal.SIGKILL in scenario.exits:
         stage.kill(signal.SIGKILL)
-    if not guard.has_ended(FLY_ON_S):
-        landing = "AUTO.LAND" if stage.is_px4 else "LAND"
-        verdict.taken_over_ns = stage.relay.set_mode(landing)
+    if not guard.has_ended(hold_s):
+        verdict.taken_over_ns = stage.relay.set_mode("POSCTL" if stage.is_px4 else "LOITER")
         if not guard.has_ended(END_S):
             verdict.wrong.append(f"the guard still runs {END_S:.0f} s after a takeover")

@@ -23,7 +23,7 @@ from sitl.clock import NS_PER_MS, Clock
 
 TIMEOUT_S = 90.0
 STARTS = 3
-LEANING = 100
+LEANING = 40
 """Consecutive leaning messages of sticks that show that the policy holds its lean."""
 STICKS_OVER_NS = 200 * NS_PER_MS
 """Time without a stick of the policy after which its flight is over."""
@@ -36,6 +36,13 @@ MARK = "FAULT_MARK"
 fault, in ns of CLOCK_MONOTONIC."""
 PIPE_BLOCK = 4096
 CATALOGUE = Path(__file__).parent / "catalogue"
+VEHICLE = """
+from functools import partial
+from sitl import app
+app.VehicleConfig = partial(app.VehicleConfig, estimator_ready_s=0.5, position_ready_s=0.5)
+raise SystemExit(app.run())
+"""
+"""``python -m sitl``, but for the seconds that its estimator takes to find its position."""
 ProcessName = Literal["flight", "guard", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
 
@@ -85,7 +92,7 @@ class Stage:
         return "px4" in self._vehicle_flags
 
     def _start_vehicle(self) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "sitl", "--report", str(self.folder / "fc.json")]
+        command = [sys.executable, "-c", VEHICLE, "--report", str(self.folder / "fc.json")]
         command += ["--connect", f"udpout:127.0.0.1:{self.relay.port}"]
         return subprocess.Popen([*command, *self._vehicle_flags], stderr=subprocess.DEVNULL)
 

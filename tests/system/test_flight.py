@@ -58,9 +58,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     """Takes off, holds its altitude, ends after its duration; recorded, with a viewer's file."""
     folder = tmp_path_factory.mktemp("flight")
     recording = folder / "recording"
-    with staged(folder) as flying:
+    with staged(folder, renders=False) as flying:
         flags = ("--record", str(recording), "--rerun", str(recording / "flight.rrd"))
-        status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "8", *flags)
+        status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "6", *flags)
     assert status == 0, output
     overrides = flying.relay.overrides
     return Flown(overrides, output, flying.report(), flying.vehicle_report(), recording)
@@ -112,8 +112,8 @@ def test_the_recording_is_what_happened(flown: Flown) -> None:
 
 
 def test_readonly_runs_both_loops_or_one_after_a_warning_and_sends_nothing(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
-        status, output = flying.fly("--dual-rate", "--readonly", "--duration", "2")
+    with staged(tmp_path, renders=False) as flying:
+        status, output = flying.fly("--dual-rate", "--readonly", "--duration", "1")
         assert status == 0, output
         shipped = flying.report()
         flags = ("--policy", faulty_policy("SingleRate"), "--dual-rate", "--readonly")
@@ -132,7 +132,7 @@ def test_readonly_runs_both_loops_or_one_after_a_warning_and_sends_nothing(tmp_p
 
 def test_a_signal_while_the_recording_is_closed_loses_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
-    with staged(tmp_path) as flying:
+    with staged(tmp_path, renders=False) as flying:
         flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
         assert flying.relay.has_flown.wait(60)
         guard, writer = flying.guard, Process(flying.pid_of("recorder"), flying.clock)
@@ -150,11 +150,12 @@ def test_a_signal_while_the_recording_is_closed_loses_nothing(tmp_path: Path) ->
 
 def test_a_killed_writer_costs_the_images_and_not_the_outcome(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
-    with staged(tmp_path) as flying:
+    with staged(tmp_path, renders=False) as flying:
         flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
         assert flying.relay.has_flown.wait(60)
         Process(flying.pid_of("recorder"), flying.clock).kill(signal.SIGKILL)
         flying.observe(0.5)
+        assert flying.relay.newest_steering(1)[0].is_command  # it flies on
         flying.kill(signal.SIGTERM)
         assert flying.end()[0] in ORDERLY
     meta = open_flight(folder).meta
@@ -164,7 +165,7 @@ def test_a_killed_writer_costs_the_images_and_not_the_outcome(tmp_path: Path) ->
 
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     folder = tmp_path / "recording"
-    with staged(tmp_path) as flying:
+    with staged(tmp_path, renders=False) as flying:
         flying.start(*FLY, "--policy", "scripted:square", "--record", str(folder))
         assert flying.relay.has_flown.wait(60)
         flying.kill(signal.SIGKILL)

@@ -54,7 +54,7 @@ class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
-    lean_calls, fault_calls = 120, 260
+    lean_calls, fault_calls = 120, 200
     """Calls in flight after which it leans, and after which its fault begins. On the ground the
     count stays below the first."""
     least_climb_mps = 0.3
