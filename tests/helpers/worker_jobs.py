@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavbridge.commands import episode_workers
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.simulation.referee import EpisodeInterruptedError
 
@@ -34,7 +33,6 @@ def run(job: Job, should_stop: Callable[[], bool]) -> int:
         (job.folder / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGKILL)
     if job.kills_parent:
-        episode_workers.END_TIMEOUT_S = 0.1
         os.kill(os.getppid(), signal.SIGKILL)
     if job.gets_ctrl_c:
         signal.raise_signal(signal.SIGINT)

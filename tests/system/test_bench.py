@@ -2,18 +2,9 @@
 
 import pytest
 
-from benchmarks import compare
 from benchmarks.link import BARE_CLIENT, OUR_CLIENT, time_link
 
 pytestmark = pytest.mark.system
-
-
-def test_a_flight_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compare, "FLIGHT_S", 1)
-    flight = compare.fly()
-    assert flight["timing"]["sticks"]["lateness_ms"]["p50"] > 0
-    assert 0 < flight["cpu_cores"]["guard"] < flight["cpu_cores"]["flight"] * 10
-    assert flight["timing"]["action"]["rate_hz"] > 0
 
 
 def test_our_client_answers_the_vehicle_of_the_link_test() -> None:

@@ -34,7 +34,7 @@ FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 
 
 def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
+    with staged(tmp_path, renders=False) as flying:
         flying.cameras = ("down", "front")  # their order is the contract's, not this one
         folder = tmp_path / "recording"
         flags = ("--policy", faulty_policy("TwoEyed"), "--duration", "4")
@@ -50,7 +50,7 @@ def test_two_cameras_feed_one_policy(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_the_second_camera_ends_the_flight(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
+    with staged(tmp_path, renders=False) as flying:
         flying.cameras = ("front", "down")
         status, output = flying.fly(*FLY, "--policy", faulty_policy("HangingBelow"))
     assert status == 4
@@ -133,8 +133,8 @@ def test_check_says_rate_and_latency_and_refuses_the_other_kind(
 def test_a_depth_policy_is_flown_and_recorded_and_refused_with_a_camera_of_colour(
     tmp_path: Path, depth_policy: str
 ) -> None:
-    fly = ("--mode", "ALT_HOLD", "--arm", "--policy", depth_policy)
-    with staged(tmp_path) as flying, sent("shm", tmp_path) as source:
+    fly = (*FLY, "--policy", depth_policy)
+    with staged(tmp_path, renders=False) as flying, sent("shm", tmp_path) as source:
         status, output = flying.fly(*fly)
         assert status == 2, output
         assert "delivers RGB images of" in output
@@ -143,6 +143,9 @@ def test_a_depth_policy_is_flown_and_recorded_and_refused_with_a_camera_of_colou
         folder = tmp_path / "recording"
         status, output = flying.fly(*fly, "--duration", "3", "--record", str(folder))
     assert status == 0, output
+    report = flying.report()
+    assert (report["mode"], report["action"]["target_hz"]) == ("single", 30)
+    assert "single-rate" in output  # it has no fast path
     recorded = open_flight(folder)
     images = list(recorded.images())
     assert recorded.meta.finished

@@ -35,11 +35,12 @@ def test_a_worker_that_dies_ends_the_run_and_its_job_is_named(tmp_path: Path) ->
 
 KILLED_PARENT = """
 from helpers.worker_jobs import Job, run
-from mavbridge.commands.episode_workers import fly_jobs
+from mavbridge.commands import episode_workers
 from mavbridge.config.episodes import WorkersConfig
+episode_workers.END_TIMEOUT_S = 0.1  # workers read this file, too
 if __name__ == "__main__":
     jobs = [Job(number=1, waits_for_stop=True), Job(number=2, kills_parent=True)]
-    list(fly_jobs(run, jobs, WorkersConfig(workers=2), lambda: False))
+    list(episode_workers.fly_jobs(run, jobs, WorkersConfig(workers=2), lambda: False))
 """
 
 
@@ -91,7 +92,7 @@ def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
     for workers in (1, 2):
         config = EvaluateConfig(
             policy=CIRCLE,
-            episodes=3,
+            episodes=2,
             max_time=1.0,
             conditions="random",
             workers=WorkersConfig(workers=workers),

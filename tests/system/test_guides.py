@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from faults.stage import VEHICLE
 from helpers.guides import ROOT, blocks, command_lines
 from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
@@ -60,7 +61,7 @@ def here(words: Sequence[str], ports: dict[str, str], folder: Path) -> list[str]
 def fly(vehicle: Sequence[str], terminals: Sequence[Sequence[str]], folder: Path) -> str:
     """What the last terminal printed; the others run beside it, and the vehicle."""
     with ExitStack() as stack:
-        beside = ([sys.executable, "-m", "sitl", *vehicle], *terminals[:-1])
+        beside = ([sys.executable, "-c", VEHICLE, *vehicle], *terminals[:-1])
         for number, command in enumerate(beside):
             stack.enter_context(running(*command, log=folder / f"{number}.log"))
         flight = subprocess.run(

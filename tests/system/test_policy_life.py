@@ -13,11 +13,11 @@ MAIN, VISION, ACTION = "MainThread", "mavbridge-vision", "mavbridge-policy"
 
 
 def test_a_file_of_the_users_flies_after_a_takeoff_and_lives_by_the_guide(tmp_path: Path) -> None:
-    with staged(tmp_path) as flying:
-        flags = ("--mode", "ALT_HOLD", "--arm", "--takeoff", "4", "--duration", "12")
+    with staged(tmp_path, renders=False) as flying:
+        flags = ("--mode", "ALT_HOLD", "--arm", "--takeoff", "2", "--duration", "6")
         status, output = flying.fly("--dual-rate", *flags, "--policy", noted_policy(tmp_path))
     assert status == 0, output
-    assert flying.vehicle_report()["max_altitude_m"] > 3.0
+    assert flying.vehicle_report()["max_altitude_m"] > 1.7
     calls = noted_calls(tmp_path)
     assert calls[0] == ("__init__", MAIN)
     assert calls[-1] == ("close", MAIN)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from faults.props import Transmitter
-from faults.stage import ORDERLY, staged
+from faults.stage import ORDERLY, VEHICLE, staged
 from helpers.status import printed_by, status_of
 from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
@@ -27,9 +27,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the expert's flight over a course, and the vehicle's own report of it."""
     folder, port = tmp_path_factory.mktemp("pilot"), free_port()
     camera = ("--camera", f"shm:record-{port}")
-    sitl = [sys.executable, "-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}", *camera]
+    sitl = [sys.executable, "-c", VEHICLE, "--connect", f"udpout:127.0.0.1:{port}", *camera]
     sitl += ["--image-size", "64", "--report", str(folder / "fc.json")]
-    sitl += ["--course", "5", "--pilot", "expert", "--pilot-speed", "6"]
+    sitl += ["--course", "5", "--pilot", "expert", "--pilot-speed", "10"]
     link = ("--connect", f"udp:127.0.0.1:{port}", *camera)
     with running(*sitl, log=folder / "sitl.log"):
         flags = ("--out", str(folder / "flights"), "--on-arm", "--episodes", "1")
@@ -79,10 +79,10 @@ def test_it_is_trained_from_and_exported(flown: Path, capsys: pytest.CaptureFixt
 
 def test_a_pilot_who_takes_over_by_the_switch_labels_the_flight(tmp_path: Path) -> None:
     transmitter, recording = Transmitter("mid"), tmp_path / "recording"
-    with staged(tmp_path, "--receiver", "mid", *transmitter.flags) as flying:
+    with staged(tmp_path, "--receiver", "mid", *transmitter.flags, renders=False) as flying:
         flying.start(*FLY, "--policy", "scripted:hover", "--record", str(recording))
         assert flying.wait_for("FLYING: the policy has control")
-        flying.observe(4.0)
+        flying.observe(2.5)
         transmitter.move(PITCH_CHANNEL, FORWARD_US)
         transmitter.move(SWITCH, 1000)
         flying.observe(2.0)

@@ -39,17 +39,6 @@ class Climbing:
         return self.predict_fast(image, state, history, steps)
 
 
-class SingleRate:
-    """Climbs; has no fast path."""
-
-    contract = Contract(arrays="numpy")
-
-    def predict(self, image: Array, state: Array, history: Array, steps: int) -> Array:
-        chunk = np.zeros((1, self.contract.horizon, 4), dtype=np.float32)
-        chunk[..., 0] = 0.5
-        return chunk
-
-
 class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
 

@@ -71,7 +71,7 @@ def test_modules_of_the_working_directory_are_not_run(trap: Path) -> None:
 
 @pytest.mark.system  # loads the network, and starts workers and writers of videos
 def test_modules_beside_weights_are_not_run(trap: Path) -> None:
-    flights = ("--episodes", "2", "--workers", "2", "--max-time", "2", "--out", "out")
+    flights = ("--episodes", "2", "--workers", "2", "--max-time", "1", "--out", "out")
     ended = start(trap, "-m", "mavbridge", "demonstrate", *flights, "--checkpoint", WEIGHTS.name)
     assert ended.returncode == 0, ended.stderr
     require_unsprung(trap)
