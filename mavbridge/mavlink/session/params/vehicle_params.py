@@ -53,6 +53,8 @@ class VehicleParams:
         self._context = ParamContext(None, config.source_system, None, None, risks, port)
         self._open: dict[str, tuple[int, int]] = {}
         """Time of the last request and number of requests, by name of a parameter to read."""
+        self._has_answered = False
+        """True if the vehicle has answered any of the requests."""
         self._relevant: set[str] = set()
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
@@ -92,6 +94,10 @@ class VehicleParams:
 
     def receive(self, param: ParamValue | ParamAbsent, status: VehicleStatus | None) -> None:
         """Process a PARAM_VALUE, requested or not, or note that a parameter does not exist."""
+        if not self._has_answered:  # what was given up before may only have been lost
+            self._has_answered = True
+            self.is_read = self.is_read and status is not None and status.armed
+            self._read(tuple(self._relevant))
         if isinstance(param, ParamAbsent):
             self._open.pop(param.name, None)
             return
