@@ -12,8 +12,9 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
+from policy.adapters.description import DESCRIPTION
 from policy.contract import Contract
-from policy.files import user_path
+from policy.files import CONTRACT_FILE, user_path
 from policy.loading.builtin import shipped_weights
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
@@ -24,6 +25,8 @@ STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
 """Suffixes of the files in a policy's folder that belong to it."""
+BESIDE = (CONTRACT_FILE, DESCRIPTION)
+"""Files that are read beside a policy of one file, with its external weights, FILE.data."""
 
 
 def load_configured_policy(
@@ -80,6 +83,8 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
         files += sorted(each for each in path.iterdir() if each.suffix in POLICY_SUFFIXES)
     elif path.is_file():
         files.append(path)
+        beside = sorted(path.parent.iterdir()) if wanted.kind in FILE_KINDS else []
+        files += [each for each in beside if each.name in BESIDE or each.stem == path.name]
     return files
 
 

@@ -128,3 +128,14 @@ def test_a_camera_that_is_not_there_is_needed_only_by_who_looks(
     with pytest.raises(CameraError, match="not there") as caught:
         require_cameras(FlyConfig(policy=PolicyConfig(policy=policy), camera=camera))
     assert ("--camera none" in str(caught.value)) is is_hinted
+
+
+@pytest.mark.parametrize("policy", ["onnx:{}/a.onnx", "torchscript:{}/a.pt"])
+def test_what_is_read_beside_one_file_belongs_to_it(tmp_path: Path, policy: str) -> None:
+    """Otherwise --resume mixes flights by other weights or another contract."""
+    names = ("a.onnx", "a.onnx.data", "a.pt", "a.pt.data", "policy.json", "mavbridge.toml")
+    for name in (*names, "b.onnx", "b.onnx.data", "b.pt"):
+        (tmp_path / name).write_text("")
+    one = policy.partition("/")[2]
+    found = [path.name for path in policy_files(PolicyConfig(policy=policy.format(tmp_path)))]
+    assert found == [one, f"{one}.data", "mavbridge.toml", "policy.json"]
