@@ -205,10 +205,12 @@ def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Traine
 
 def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
-    if policy.contract.action != network.contract.action:
+    old, new = policy.contract, network.contract
+    if old.action != new.action or not set(old.modes) & set(new.modes):
         raise PolicyError(
-            f"--start-from {path} flies by {policy.contract.action}, these flights were flown by "
-            f"{network.contract.action}: start from one of their kind, or anew"
+            f"--start-from {path} flies by {old.action} in {' or '.join(old.modes)}, these flights "
+            f"were flown by {new.action} in {' or '.join(new.modes)}: start from one of their "
+            "kind, or anew"
         )
     # Contract fields without a flag of this command are taken from the checkpoint, but for the end
     # that these flights teach.

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -173,8 +174,11 @@ def test_by_rates_no_error_of_a_held_stick_is_told(flights, tmp_path):
     assert "(mean stick" in held_out.describe()
 
 
+LOITERED: tuple[dict[str, Any], str] = ({"modes": ("LOITER",)}, "sticks in LOITER")
+
+
 def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_path):
-    terms = {"modes": ("LOITER",), "max_chunk_age_s": 1.0, "max_stall_s": 0.35, "play_s": 0.1}
+    terms = {"modes": ("ALT_HOLD",), "max_chunk_age_s": 1.0, "max_stall_s": 0.35, "play_s": 0.1}
     start = Toge(replace(NETWORK, contract=replace(CONTRACT, **terms)))
     path = tmp_path / "start.safetensors"
     save_checkpoint(path, start)
@@ -190,9 +194,10 @@ def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_p
     with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
         run(flights[:2], refused, network=other)
     assert not refused.work_folder.exists()
-    by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
-    with pytest.raises(PolicyError, match="flies by sticks, these flights were flown by rates"):
-        run(flights[:2], further, network=by_rates)
+    for changes, told in (({"action": "rates", "modes": ()}, "rates in GUIDED"), LOITERED):
+        network = replace(NETWORK, contract=replace(CONTRACT, **changes))
+        with pytest.raises(PolicyError, match=f"flies by sticks in ALT_HOLD, .* by {told}"):
+            run(flights[:2], further, network=network)
 
 
 def test_only_the_end_is_learned_and_the_gates_are_flown_as_before(flights, tmp_path):
