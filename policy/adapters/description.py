@@ -8,6 +8,7 @@ import json
 import re
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,12 @@ _EXTERNAL = re.compile(
     r"(?:externally stored data in file \(|data_full_path: )(.+), offset: ", re.S
 )
 """In an error of OpenVINO: the file whose external weights are missing."""
+
+
+def is_ordered(names: Sequence[str], roles: Sequence[str]) -> bool:
+    """True unless an argument has the usual name of another of the ``roles`` than its own."""
+    places = {name: at for at, role in enumerate(roles) for name in USUAL_NAMES[role]}
+    return all(places.get(name, at) == at for at, name in enumerate(names))
 
 
 @dataclass(frozen=True, kw_only=True)

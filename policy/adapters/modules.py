@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from policy.adapters.description import USUAL_NAMES, Description
+from policy.adapters.description import USUAL_NAMES, Description, is_ordered
 from policy.adapters.interface import Interface
 from policy.contract import ACTION_DIM
 from policy.engines.torch_engines import modules_of
@@ -287,15 +287,12 @@ class _Call:
 
     def require_order(self) -> None:
         """Raise PolicyError if an argument has the usual name of another role than its own."""
-        roles = self._roles
-        places = {name: at for at, role in enumerate(roles) for name in USUAL_NAMES[role]}
-        for at, name in enumerate(self.names, self.skip):
-            if places.get(name, at) != at:
-                raise PolicyError(
-                    f"{self._name}: its {self._result} is made from {', '.join(roles)}, passed in "
-                    f"this order, but the arguments are {', '.join(self.names)}: reorder or rename "
-                    "them"
-                )
+        if not is_ordered(["", *self.names][1 - self.skip :], self._roles):
+            raise PolicyError(
+                f"{self._name}: its {self._result} is made from {', '.join(self._roles)}, passed "
+                f"in this order, but the arguments are {', '.join(self.names)}: reorder or rename "
+                "them"
+            )
 
     def __call__(self, *arguments: Tensor) -> Tensor:
         returned: object = self._function(*arguments[self.skip :][: self._count])

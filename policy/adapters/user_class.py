@@ -16,7 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 
-from policy.adapters.description import Description
+from policy.adapters.description import Description, is_ordered
 from policy.adapters.interface import Interface
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError, user_code, user_line
@@ -198,6 +198,23 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
             "predict_fast(feature, state, action_history, num_diffusion_steps); a class of torch "
             "modules has visual_encoder and action_head, or forward"
         )
+    _require_order(spec, policy)
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
     return policy
+
+
+def _require_order(spec: str, policy: object) -> None:
+    """Raise PolicyError if a method names its arguments in another order than they are passed."""
+    for method, seen in (("predict", "image"), ("predict_fast", "feature")):
+        roles = (seen, "state", "action_history")
+        try:
+            names = [*inspect.signature(getattr(policy, method)).parameters]
+        except (AttributeError, TypeError, ValueError):  # no such method, or none in Python
+            continue
+        is_told = not any(name.startswith("obs") for name in names)  # any input may be one
+        if is_told and not is_ordered(names, roles):
+            raise PolicyError(
+                f"--policy {spec}: {method} is called with {', '.join(roles)}, "
+                f"num_diffusion_steps in this order, and has {', '.join(names)}: reorder them"
+            )

@@ -229,6 +229,26 @@ class NoFeatureDim(Single):
     encode_visual = predict_fast = Single.predict
 
 
+class Swapped(Single):
+    def predict(self, state, image, action_history, num_diffusion_steps):
+        return np.zeros((1, 16, 4), np.float32)
+
+
+class SwappedFast(Single):
+    contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=13)
+
+    def encode_visual(self, image):
+        return np.zeros((1, 13), np.float32)
+
+    def predict_fast(self, state, feature, history, steps):
+        return np.zeros((1, 16, 4), np.float32)
+
+
+class Observing(Single):
+    def predict(self, observation, state, history, steps):
+        return np.full((1, 16, 4), 0.5, np.float32)
+
+
 class ResetNeedsMore(Single):
     def reset(self, seed):
         pass
@@ -293,6 +313,8 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
         ("NoPredict", {}, "no method predict"),
         ("PredictIsNone", {}, "no method predict"),
         ("NoFeatureDim", {}, "needs feature_dim"),
+        ("Swapped", {}, "predict is called with image, state, .* and has state, image, action_h"),
+        ("SwappedFast", {}, "predict_fast is called with feature, .* has state, feature, history"),
         ("ResetNeedsMore", {}, "failed to reset: TypeError: .*missing 1 required .*'seed'"),
         ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
         ("FailsInALibrary", {}, r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)"),
@@ -306,6 +328,10 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 def test_an_unusable_class_is_refused(mine, name, changes, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{mine}:{name}", **changes)
+
+
+def test_any_input_may_be_called_an_observation(mine: str) -> None:
+    assert throttle(load(f"{mine}:Observing")) == 0.5
 
 
 @pytest.mark.parametrize("name", ["FastPair", "RegisteredPair"])
