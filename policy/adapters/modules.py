@@ -287,7 +287,7 @@ class _Call:
 
     def require_order(self) -> None:
         """Raise PolicyError if an argument has the usual name of another role than its own."""
-        if not is_ordered(["", *self.names][1 - self.skip :], self._roles):
+        if not is_ordered([""] * self.skip + list(self.names), self._roles):
             raise PolicyError(
                 f"{self._name}: its {self._result} is made from {', '.join(self._roles)}, passed "
                 f"in this order, but the arguments are {', '.join(self.names)}: reorder or rename "
