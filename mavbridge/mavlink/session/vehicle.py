@@ -125,6 +125,7 @@ _FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
 simulator clock, plus a margin."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
+"""Most requests to a vehicle that answers those for parameters."""
 
 
 class VehicleSession:
@@ -259,7 +260,7 @@ class VehicleSession:
         is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
         if is_version_open and now_ns >= self._version_due_ns:
             self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
-            self._version_attempts += 1
+            self._version_attempts += self.params.has_answered
             number = float(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Parameters first: a vehicle slows its streams down while it sends parameters.

@@ -343,6 +343,24 @@ def test_sticks_need_a_px4_that_shows_the_throttle_as_it_was_sent(
     assert (session.problem and session.problem.code) == code
 
 
+def test_the_version_is_asked_for_until_the_vehicle_answers_and_then_eight_times() -> None:
+    session = Session("px4", is_ready=False)
+
+    def asked(seconds: int) -> int:
+        count = 0
+        for _ in range(10 * seconds):
+            session.now_ns += 100 * MS
+            for request in session.session.step(session.now_ns):
+                is_command = isinstance(request, CommandRequest)
+                count += is_command and request.command == dialect.MAV_CMD_REQUEST_MESSAGE
+        return count
+
+    assert asked(8) == 20
+    session.put(ParamValue("MPC_THR_HOVER", 0.5))
+    assert asked(8) == 8
+    assert asked(8) == 0
+
+
 def test_px4s_events_without_a_text_are_shown() -> None:
     session = Session("px4")
     session.put(Event(0x155CD44, 1))

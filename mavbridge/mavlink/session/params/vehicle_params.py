@@ -53,7 +53,7 @@ class VehicleParams:
         self._context = ParamContext(None, config.source_system, None, None, risks, port)
         self._open: dict[str, tuple[int, int]] = {}
         """Time of the last request and number of requests, by name of a parameter to read."""
-        self._has_answered = False
+        self.has_answered = False
         """True if the vehicle has answered any of the requests."""
         self._relevant: set[str] = set()
         self._kinds: dict[str, int] = {}
@@ -94,8 +94,8 @@ class VehicleParams:
 
     def receive(self, param: ParamValue | ParamAbsent, status: VehicleStatus | None) -> None:
         """Process a PARAM_VALUE, requested or not, or note that a parameter does not exist."""
-        if not self._has_answered:  # what was given up before may only have been lost
-            self._has_answered = True
+        if not self.has_answered:  # what was given up before may only have been lost
+            self.has_answered = True
             self.is_read = self.is_read and status is not None and status.armed
             self._read(tuple(self._relevant))
         if isinstance(param, ParamAbsent):
