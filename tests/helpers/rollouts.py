@@ -29,6 +29,7 @@ from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.tables import read_table
+from mavbridge.simulation.clock import SteppedClock
 from policy.contract import Contract
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
@@ -103,7 +104,7 @@ def make_plan(**changes: int) -> RolloutPlan:
 
 def make_decider(name: str, sampler: Sampler) -> Decider:
     if name == "toge":
-        return PolicyDecider(noise_runner(), sampler)
+        return PolicyDecider(noise_runner(), sampler, SteppedClock(START_NS))
     return WorldModelDecider(sampler, from_pixels="pixels" in name)
 
 

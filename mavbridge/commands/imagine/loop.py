@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
@@ -127,15 +127,16 @@ class ObservationQueue:
         self._states = deque(start.states, maxlen=len(start.states))
         self.images: deque[ImageArray] = deque(start.images, maxlen=decider.images)
         self._step_ns = round(sampler.config.frame_dt_s * NS_PER_S)
-        self._now_ns = start.newest_ns
+        self.now_ns = start.newest_ns
+        """Exposure of the newest frame, on the flight's clock."""
         self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
         for at_ns, sticks in start.sent:
             self._history.append(sticks, at_ns)
 
     def push(self, latent: Tensor, state: FloatArray, action: FloatArray) -> None:
         """Add a step: latent [C, h, w] and state [13] that result from holding ``action`` [4]."""
-        self._history.append(Sticks(*action.tolist()), self._now_ns)
-        self._now_ns += self._step_ns
+        self._history.append(Sticks(*action.tolist()), self.now_ns)
+        self.now_ns += self._step_ns
         self._latents.append(latent)
         self._states.append(state)
 
@@ -149,7 +150,7 @@ class ObservationQueue:
 
     def history(self) -> FloatArray:
         """Return the executed sticks up to now by the decider's contract, [1, K, 4]."""
-        return self._history.resample(self._now_ns)
+        return self._history.resample(self.now_ns)
 
 
 class Decider(Protocol):
@@ -180,8 +181,8 @@ class PolicyDecider:
 
     images = 1
 
-    def __init__(self, runner: PolicyRunner, sampler: Sampler) -> None:
-        """Check that policy and world model fit together.
+    def __init__(self, runner: PolicyRunner, sampler: Sampler, clock: Clock) -> None:
+        """Check that policy and world model fit together; ``clock`` is the policy's.
 
         Raises:
             UserError: states or sticks differ in meaning, or the policy takes inputs that are not
@@ -199,12 +200,13 @@ class PolicyDecider:
             )
         require_terms(sampler.config.contract, seen, f"the policy {runner.name}")
         self.contract = runner.contract
-        self._runner = runner
+        self._runner, self._clock = runner, clock
         self._frames = sampler.config.frames
         self._frame_dt_s = sampler.config.frame_dt_s
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
         """Return a chunk's mean over each step. Its noise was fixed when the policy was loaded."""
+        self._clock.sleep_until_ns(seen.now_ns)
         state = seen.states()[:, -1]
         if self.contract.since_exposure:
             # Image and state have the same age: no motion since the exposure.

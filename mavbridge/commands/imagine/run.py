@@ -24,13 +24,14 @@ from mavbridge.commands.imagine.loop import (
 )
 from mavbridge.commands.imagine.output import StreamedOutput, prepare_out
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.simulation.clock import SteppedClock
 from policy.checkpoints.networks import load_world_model
 from policy.engines.runner import require_device
 from policy.errors import Warned
@@ -70,7 +71,8 @@ def imagine(config: ImagineConfig) -> int:
     # last of them is done.
     free = torch.get_num_threads() - 1
     with ExitStack() as stack:
-        decider = _make_decider(config, sampler, console, stack)
+        clock = SteppedClock(start.newest_ns)
+        decider = _make_decider(config, sampler, clock, console, stack)
         stack.enter_context(torch_threads(free))
         output = StreamedOutput(config.out, sampler, plan, decode_video=config.decode_video)
         stack.callback(output.close)
@@ -121,14 +123,14 @@ def run_rollout(
 
 
 def _make_decider(
-    config: ImagineConfig, sampler: Sampler, console: Console, stack: ExitStack
+    config: ImagineConfig, sampler: Sampler, clock: Clock, console: Console, stack: ExitStack
 ) -> Decider:
     if config.decider == "world-model":
         return WorldModelDecider(sampler, from_pixels=not config.fast_policy_no_decode)
-    loaded = stack.enter_context(load_configured_policy(config.policy, MonotonicClock()))
+    loaded = stack.enter_context(load_configured_policy(config.policy, clock))
     for note in loaded.notes:
         console.print(note, style="yellow" if isinstance(note, Warned) else "dim")
-    return PolicyDecider(loaded.runner, sampler)
+    return PolicyDecider(loaded.runner, sampler, clock)
 
 
 def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:

@@ -30,6 +30,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.rows import FrameRow
+from mavbridge.simulation.clock import SteppedClock
 from policy.contract import Contract
 
 
@@ -80,7 +81,22 @@ def test_a_start_from_a_state_that_is_too_old_is_refused_with_its_age(flight: Pa
 def test_a_policy_by_body_rates_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", action="rates")
     with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):
-        PolicyDecider(noise_runner(other), make_sampler())
+        PolicyDecider(noise_runner(other), make_sampler(), SteppedClock())
+
+
+def test_a_scripted_policy_lives_in_imagined_time() -> None:
+    start, sampler, times = make_start(), make_sampler(), []
+    clock = SteppedClock(start.newest_ns)
+
+    def act(*_: object) -> FloatArray:
+        times.append(clock.now_ns() - start.newest_ns)
+        return np.zeros((1, 16, 4), np.float32)
+
+    decider = PolicyDecider(replace(noise_runner(), act=act), sampler, clock)
+    for _ in rollout(sampler, decider, start, make_plan(exe_steps=2)):
+        pass
+    step_ns = round(TINY.frame_dt_s * NS_PER_S)
+    assert times == [0, 2 * step_ns, 4 * step_ns]
 
 
 @pytest.mark.parametrize(
@@ -108,7 +124,7 @@ def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
         return chunk
 
     sampler = make_sampler()
-    decider = PolicyDecider(replace(ramp, act=act), sampler)
+    decider = PolicyDecider(replace(ramp, act=act), sampler, SteppedClock())
     actions = decider.decide(ObservationQueue(make_start(), sampler, decider), 0)
     # rows of the chunk are 0.05 s apart, steps 0.1 s: their mean is the row between; then held
     np.testing.assert_allclose(actions[:7, 0], chunk[0, 1:15:2, 0], atol=1e-6)
