@@ -219,7 +219,8 @@ def _is_script(method: object) -> bool:
 def _takes_no_image(call: "_Call", interface: Interface) -> bool:
     """True if the first argument of a forward is the state.
 
-    Decided by the argument's name; a single argument without a telling name is tried.
+    Decided by the argument's name; a single argument without a telling name is tried. Raises
+    PolicyError if it accepts both.
     """
     first = next(iter(call.names), "")
     if first in USUAL_NAMES["state"]:
@@ -236,6 +237,11 @@ def _takes_no_image(call: "_Call", interface: Interface) -> bool:
             accepted.append(True)
         except Exception:  # noqa: BLE001 - a foreign module may raise anything
             accepted.append(False)
+    if all(accepted):
+        raise PolicyError(
+            f"{call.name}: its {first or 'input'} may be a state or an image, it takes both: call "
+            f'it so, or write "inputs": {{"state": "{first}"}} into policy.json'
+        )
     return accepted == [True, False]
 
 
@@ -262,7 +268,7 @@ class _Call:
         ``inputs`` name arguments. An argument with a number or text as its default is a setting
         and keeps it, with all after it, unless it is named as a role.
         """
-        self._name, self._function, self._roles = name, function, roles
+        self.name, self._function, self._roles = name, function, roles
         self._result, self._pick = result, description.outputs.get(result)
         self.skip = 0
         """Leading arguments to drop: 1 for a policy that takes no image."""
@@ -289,7 +295,7 @@ class _Call:
         """Raise PolicyError if an argument has the usual name of another role than its own."""
         if not is_ordered([""] * self.skip + list(self.names), self._roles):
             raise PolicyError(
-                f"{self._name}: its {self._result} is made from {', '.join(self._roles)}, passed "
+                f"{self.name}: its {self._result} is made from {', '.join(self._roles)}, passed "
                 f"in this order, but the arguments are {', '.join(self.names)}: reorder or rename "
                 "them"
             )
@@ -302,7 +308,7 @@ class _Call:
         if isinstance(values, Mapping):
             if self._pick not in values:
                 raise PolicyError(
-                    f"{self._name}: it returns {len(values)} values "
+                    f"{self.name}: it returns {len(values)} values "
                     f"({', '.join(map(str, values))}): say which "
                     f'is the {self._result}, in policy.json, "outputs": {{"{self._result}": '
                     f"{json.dumps(next(iter(values), 0))}}}"
@@ -310,11 +316,11 @@ class _Call:
             returned = values[self._pick]
         if not isinstance(returned, Tensor):
             raise PolicyError(
-                f"{self._name}: its {self._result} is a {type(returned).__name__}, not a tensor"
+                f"{self.name}: its {self._result} is a {type(returned).__name__}, not a tensor"
             )
         if not returned.is_floating_point():
             raise PolicyError(
-                f"{self._name}: its {self._result} is of type {returned.dtype}, and the contract's "
+                f"{self.name}: its {self._result} is of type {returned.dtype}, and the contract's "
                 "numbers are not whole: what do they count? Export the continuous actions"
             )
         return returned

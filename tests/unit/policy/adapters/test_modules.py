@@ -144,6 +144,20 @@ def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(act(runner)[0, 0] + 0.5, abs=1e-3)
 
 
+class Flattening(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 8, 4) + x.flatten()[0]
+
+
+def test_one_input_that_may_be_a_state_or_an_image_is_not_guessed(tmp_path: Path) -> None:
+    path = archive(tmp_path, Flattening(), described())
+    with pytest.raises(PolicyError, match=r"its x may be a state or an image.*policy\.json"):
+        load(f"torchscript:{path}", dual_rate=False)
+    path = archive(tmp_path, Flattening(), described(inputs={"state": "x"}))
+    runner = load(f"torchscript:{path}", dual_rate=False).runner
+    assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(0.5, abs=1e-3)
+
+
 class ImageAsObs(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)
