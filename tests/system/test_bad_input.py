@@ -25,50 +25,6 @@ def test_help_of_fly_names_every_flag_of_the_contract() -> None:
     assert missing == []
 
 
-FLY = "--connect udp:127.0.0.1:1"
-BLIND = "--policy scripted --camera none"
-
-
-@pytest.mark.parametrize(
-    ("flags", "told"),
-    [
-        ("", "--connect"),
-        (f"{FLY} --fly-high", "Unknown option: --fly-high"),
-        (f"{FLY} --set-config rates.action=fast", "Invalid value for --rates.action"),
-        (f"{FLY} --readonly --arm", "--readonly sends nothing"),
-        (f"{FLY} --set RC_OVERRIDE_TIME", "use NAME=VALUE"),
-        (f"{FLY} --set-config link.accept_risk=all", "endless-override"),
-        (f"{FLY} --config none.toml", "none.toml"),
-        (f"{FLY} --gates none.json", "--gates none.json"),
-        (f"{FLY} --policy toge:medium", "network.allow_untrained"),
-        (f"{FLY} --policy tog", "tog"),
-        (f"{FLY} --policy nowhere.at_all:Policy", "nowhere"),
-        (f"{FLY} --camera none --policy pathlib:Path", "its member contract"),
-        (f"{FLY} --policy scripted:loop", "square"),
-        (f"{FLY} --policy scripted:yaw:position", "velocity"),
-        (f"{FLY} --checkpoint no.safetensors", "no.safetensors"),
-        (f"{FLY} --policy toge:huge", "small"),
-        (f"{FLY} --policy scripted --camera no.mp4", "no.mp4"),
-        (f"{FLY} --policy scripted --rerun flight.txt", ".rrd"),
-        (f"{FLY} --policy scripted --record tests", "is not empty"),
-        (f"{FLY} --policy scripted --record Makefile", "cannot be written"),
-        (f"{FLY} --mode", "--mode requires an argument"),
-        (f"fly now {FLY}", "unexpected word 'now'"),
-        (f"identify {FLY} --policy tog", "tog"),
-        (f"identify {FLY} --json /proc/none/x.json", "--json"),
-        ("identify --arm", "--connect"),
-        ("evalute", "did you mean evaluate?"),
-        (f"--connect /dev/null,57600 {BLIND}", "no serial port"),
-        (f"--connect /dev/none,57600 {BLIND}", "no such"),
-        ("--connect bluetooth --policy scripted --camera shm:unused", "HOST:PORT"),
-    ],
-)
-def test_a_bad_flag_is_one_clear_error(flags: str, told: str) -> None:
-    status, text = told_by(*flags.split())
-    assert status == 2
-    assert told in text
-
-
 def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(tmp_path: Path) -> None:
     folder, report = tmp_path / "flight", tmp_path / "report.json"
     flags = ("--connect", "bluetooth", "--record", str(folder), "--report", str(report))
@@ -76,14 +32,6 @@ def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(tmp_path: Pa
     assert status == 2
     assert "HOST:PORT" in text
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_corrupt_checkpoint_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "weights.safetensors"
-    path.write_bytes(b"these are no weights")
-    status, text = told_by("--connect", "udp:127.0.0.1:1", "--checkpoint", str(path))
-    assert status == 2
-    assert "weights.safetensors" in text
 
 
 @pytest.fixture
