@@ -4,6 +4,7 @@ python -m benchmarks.link --rounds 3
 """
 
 import json
+import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,7 +18,7 @@ from rich.text import Text
 from benchmarks.link_vehicle import ATTITUDE_HZ, CONNECT_S, LinkLatency
 from mavbridge.commands.output import make_table, print_status, table_console
 from mavbridge.core.errors import UserError
-from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, running, wait
+from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, running
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.observe.terminal import number
 
@@ -82,6 +83,16 @@ def link_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
     return (OUR_CLIENT, BARE_CLIENT), (note,)
 
 
+def _wait(vehicle: "subprocess.Popen[bytes]", log: Path, timeout_s: float) -> None:
+    """Wait for the vehicle to end; raise UserError with the end of its log if it fails to."""
+    try:
+        status = vehicle.wait(timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise UserError(f"the vehicle did not end in {timeout_s:g} s: {log_tail(log)}") from error
+    if status != 0:
+        raise UserError(f"the vehicle failed with status {status}: {log_tail(log)}")
+
+
 def link_table(links: Iterable[LinkLatency]) -> Table:
     """Return a table with a row for each client."""
     rows = []
@@ -116,7 +127,7 @@ def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
             running(*vehicle_command, log=vehicle_log) as vehicle,
         ):
             try:
-                wait(vehicle, f"python -m {LINK_VEHICLE}", vehicle_log, timeout_s)
+                _wait(vehicle, vehicle_log, timeout_s)
             except UserError as error:
                 raise UserError(f"{client.name}: {error}\nits log: {log_tail(log)}") from error
             end(process)

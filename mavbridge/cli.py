@@ -33,6 +33,7 @@ from mavbridge.config.settings_files import (
     with_settings,
 )
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable
 from mavbridge.core.log import run_log
 from mavbridge.core.provenance import printable
 from mavbridge.core.realtime import require_supported_system
@@ -108,9 +109,8 @@ def _require_vehicle(connect: str) -> None:
 
 
 @cli.command(group=FLYING, help_epilogue=EXIT_CODES)
-def fly(config: FlyConfig | None = None) -> int:
+def fly(config: FlyConfig = FlyConfig()) -> int:
     """Fly. The policy gets control by an explicit act only, such as --arm."""
-    config = config or FlyConfig()
     _require_vehicle(config.link.connect)
     from mavbridge.flight.app import fly as run_flight
 
@@ -118,17 +118,16 @@ def fly(config: FlyConfig | None = None) -> int:
 
 
 @cli.default
-def _fly_by_default(config: Annotated[FlyConfig | None, Parameter(show=False)] = None) -> int:
+def _fly_by_default(config: Annotated[FlyConfig, Parameter(show=False)] = FlyConfig()) -> int:
     return fly(config)
 
 
 @cli.command(group=FLYING)
-def check(config: CheckConfig | None = None) -> int:
+def check(config: CheckConfig = CheckConfig()) -> int:
     """Check whether a flight could begin, and say why not. Takes the flags of the flight.
 
     --connect none, --policy none and --camera none leave those out. Exit status: 0 go, 3 no-go.
     """
-    config = config or CheckConfig()
     _require_vehicle(config.flight.link.connect)
     from mavbridge.commands.check.run import check as run_check
 
@@ -136,9 +135,8 @@ def check(config: CheckConfig | None = None) -> int:
 
 
 @cli.command(group=FLYING)
-def identify(config: IdentifyConfig | None = None) -> int:
+def identify(config: IdentifyConfig = IdentifyConfig()) -> int:
     """Compare the vehicle's gains and lags with those of a policy's training."""
-    config = config or IdentifyConfig()
     _require_vehicle(config.flight.link.connect)
     from mavbridge.commands.identify import identify as run_identification
 
@@ -156,7 +154,7 @@ def record(config: RecordConfig) -> int:
 
 
 @cli.command(group=REVIEWING)
-def replay(flight: Path, config: ReplayConfig | None = None) -> int:
+def replay(flight: Path, config: ReplayConfig = ReplayConfig()) -> int:
     """Compute a recorded flight again, and compare the sticks.
 
     Exit status 5: they differ.
@@ -167,11 +165,11 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
     require_extra("replay")
     from mavbridge.commands.replay import replay as run_replay
 
-    return run_replay(flight, ReplayConfig() if config is None else config)
+    return run_replay(flight, config)
 
 
 @cli.command(group=REVIEWING)
-def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
+def inspect(*flights: Path, config: InspectConfig = InspectConfig()) -> int:
     """Report on a recorded flight, or compare two: rates, latency, releases.
 
     Args:
@@ -180,16 +178,16 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
     require_extra("inspect")
     from mavbridge.commands.inspect.run import inspect as run_inspection
 
-    return run_inspection(flights, config or InspectConfig())
+    return run_inspection(flights, config)
 
 
 @cli.command(group=CONVERTING)
-def serve(config: ServeConfig | None = None) -> int:
+def serve(config: ServeConfig = ServeConfig()) -> int:
     """Serve a policy to other computers, for --policy ws://HOST:PORT."""
     require_packages("serve", *REMOTE_PACKAGES)
     from mavbridge.commands.serve import serve as run_server
 
-    return run_server(ServeConfig() if config is None else config)
+    return run_server(config)
 
 
 @cli.command(group=LEARNING)
@@ -202,12 +200,12 @@ def imagine(config: ImagineConfig) -> int:
 
 
 @cli.command(group=LEARNING)
-def evaluate(config: EvaluateConfig | None = None) -> int:
+def evaluate(config: EvaluateConfig = EvaluateConfig()) -> int:
     """Fly a policy over many simulated courses, and count the gates."""
     require_packages("evaluate", "mujoco")
     from mavbridge.commands.evaluate import evaluate as run_evaluation
 
-    return run_evaluation(EvaluateConfig() if config is None else config)
+    return run_evaluation(config)
 
 
 @cli.command(group=LEARNING)
@@ -215,7 +213,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
     """Record an expert's flights of simulated courses to learn from."""
     require_extra("demonstrate")
     require_packages("demonstrate", "mujoco")
-    from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
+    from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
 
     return run_demonstrations(config)
 
@@ -223,22 +221,14 @@ def demonstrate(config: DemonstrateConfig) -> int:
 def _prepare_training(
     command: str, flights: Sequence[Path], settings: TrainSettings | WorldModelSettings
 ) -> None:
-    """Check the paths before torch and the flights are loaded.
-
-    Raises:
-        UserError: an extra, a folder or a file is missing, or --out cannot be written.
-    """
+    """Check the paths before torch and the flights are loaded."""
     require_extra(command)
     if not flights:
         raise UserError(f"name the flights to learn from: mavbridge {command} DIR... --out FILE")
     for path in flights:
         if not path.is_dir():
             raise UserError(f"{path}: no such folder")
-    folder = settings.out.parent
-    if not folder.is_dir():
-        raise UserError(f"--out {settings.out}: there is no folder {folder}")
-    if not os.access(folder, os.W_OK):
-        raise UserError(f"--out {settings.out}: {folder} cannot be written to")
+    require_writable(settings.out, "--out")
     if settings.start_from is not None and not settings.start_from.is_file():
         raise UserError(f"--start-from {settings.start_from}: no such file")
     # torch's threads else spin at every barrier: on a core that something else uses too, ten times
@@ -286,9 +276,9 @@ def export(*flights: Path, config: ExportConfig) -> int:
         raise UserError("name the flights to export: mavbridge export DIR... --out DIR")
     if config.format == "mcap":
         require_packages("export --format mcap", "mcap")
-        from mavbridge.commands.export.mcap_file import export as run_export
+        from mavbridge.commands.export_mcap import export as run_export
     else:
-        from mavbridge.commands.export.run import export as run_export
+        from mavbridge.commands.export import export as run_export
     return run_export(flights, config)
 
 
@@ -299,21 +289,21 @@ def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig)
     Args:
         checkpoint: its weights, .safetensors; left out, those that TOGE ships with.
     """
-    from mavbridge.commands.export_policy import export_policy as run_export
+    from mavbridge.commands.convert import export_policy as run_export
 
     return run_export(checkpoint, config)
 
 
 @cli.command(group=CONVERTING)
-def contract(source: Path, config: ContractConfig | None = None) -> int:
+def contract(source: Path, config: ContractConfig = ContractConfig()) -> int:
     """Draft the contract file of a foreign policy.
 
     Args:
         source: folder of a LeRobot policy, of a LeRobot dataset, or of ONNX files; or one of those.
     """
-    from mavbridge.commands.contract import contract as run_contract
+    from mavbridge.commands.convert import contract as run_contract
 
-    return run_contract(source, config or ContractConfig())
+    return run_contract(source, config)
 
 
 @cli.meta.default

@@ -81,7 +81,7 @@ class Grabber:
         self._thread.start()
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._newest is not None or self._failure is not None, timeout_ns / NS_PER_S

@@ -17,9 +17,8 @@ from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
-from mavbridge.core.ports import Camera
 from mavbridge.core.provenance import without_secrets
-from mavbridge.core.records import CameraImage, Frame
+from mavbridge.core.records import Camera, CameraImage, Frame
 from policy.errors import require_packages
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
@@ -233,7 +232,7 @@ class BlankCamera:
         self.dropped_frames = 0
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         late = (self._clock.now_ns() - self._due_ns) // BLANK_NS
@@ -257,11 +256,11 @@ class LatencyCompensatedCamera:
 
     @property
     def dropped_frames(self) -> int:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         return self._camera.dropped_frames
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         frame = self._camera.read(timeout_ns)
         if frame is None:
             return None

@@ -121,7 +121,7 @@ class ScreenCamera:
         self._due_ns = clock.now_ns()
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`; at most 60 frames per second."""
+        """See `mavbridge.core.records.Camera`; at most 60 frames per second."""
         if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         captured_ns = self._clock.now_ns()

@@ -74,7 +74,7 @@ class SharedMemoryCamera:
         return _absent(self._path) if self._segment is None else self._failure(self._segment)
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         deadline_ns = self._clock.now_ns() + timeout_ns
         while (frame := self._take()) is None:
             now_ns = self._clock.now_ns()

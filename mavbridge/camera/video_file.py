@@ -46,7 +46,7 @@ class VideoFileCamera:
             raise CameraError(f"{path} contains no video that can be decoded")
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`."""
+        """See `mavbridge.core.records.Camera`."""
         if self._start_ns is None:
             self._start_ns = self._clock.now_ns()
         if self.upcoming is None:

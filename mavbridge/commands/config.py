@@ -11,7 +11,6 @@ from mavbridge.config.flags import (
     OUTPUT,
     POLICY,
     RATES,
-    VEHICLE,
     Between,
     Ranged,
     hidden,
@@ -69,7 +68,6 @@ class ServeConfig(Ranged):
     """Port to listen at."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be served."""
         super().__post_init__()
         object.__setattr__(self, "host", self.host.removeprefix("[").removesuffix("]"))
         if self.policy.dual_rate:
@@ -86,9 +84,6 @@ class CheckConfig(Ranged):
     """The flight to check, by its own flags."""
 
     flight: FlyConfig = field(default_factory=FlyConfig)
-    echo_test: Annotated[bool, Parameter(negative="", group=VEHICLE)] = False
-    """Send neutral sticks for up to three seconds, only while disarmed, and see whether the vehicle
-    takes them from our system id; then release them."""
     timing: Annotated[float, Parameter(group=RATES), Between(0.5, 36_000, "s")] = 3.0
     """Seconds for which the policy is run at its rates, on one dummy sample; minutes show whether
     this computer throttles."""
@@ -100,7 +95,6 @@ class CheckConfig(Ranged):
     error."""
 
     def __post_init__(self) -> None:
-        """Refuse durations that show nothing."""
         super().__post_init__()
         if self.soak is not None and self.flight.policy.policy == NO_POLICY:
             raise UserError("--soak needs a policy")
@@ -128,7 +122,6 @@ class ExportConfig:
     vertical in body axes, the same on every heading, which other networks learn from sooner."""
 
     def __post_init__(self) -> None:
-        """Refuse a task without words, and a size that a video cannot have."""
         size = self.image_size
         if size is not None and (size % 2 or not 16 <= size <= 4096):
             raise UserError(f"--image-size {size}: an even number from 16 to 4096")
@@ -166,7 +159,6 @@ class ImagineConfig(Ranged):
     """Let the world model decide from its latents, without decoding and encoding them again."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and settings that the decider ignores."""
         super().__post_init__()
         ignored = self.policy.given("device", "seed")
         if self.decider == "toge":
@@ -232,7 +224,6 @@ class RecordConfig(Ranged):
     """Gigabytes of the disk that stay free."""
 
     def __post_init__(self) -> None:
-        """Refuse contradictions, and rates that no autopilot serves."""
         super().__post_init__()
         if self.camera.sources == ("none",):
             raise UserError("--camera none: there is nothing to learn from without images")
@@ -283,7 +274,6 @@ class ReplayConfig(Ranged):
     """Write all figures here as JSON."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be combined."""
         super().__post_init__()
         of_policy = (self.policy, self.checkpoint, self.contract, self.num_diffusion_steps)
         given = (*of_policy, self.engine, self.device)

@@ -46,10 +46,8 @@ def fly_jobs(
 ) -> Iterator[tuple[int, Result]]:
     """Fly every job, and yield its index and result when ready; end early on ``should_stop``.
 
-    Raises:
-        UserError: Ray is missing, or its cluster cannot be reached.
-        PeerError: a worker died.
-        MavbridgeError: an episode cannot be flown.
+    Raises PeerError if a worker died, UserError without Ray or its cluster, and what ``fly``
+    raises.
     """
     if config.ray_address is not None:
         yield from _fly_on_ray(fly, jobs, config.workers, config.ray_address, should_stop)

@@ -22,7 +22,7 @@ from mavbridge.config.episodes import (
     WorkersConfig,
 )
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import SOLVES_PER_PLAY
+from mavbridge.config.policy import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable
@@ -76,12 +76,7 @@ class FlownEpisode:
 
 
 def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEpisode:
-    """Fly one episode in lockstep with the simulator.
-
-    Raises:
-        EpisodeInterruptedError: ``should_stop`` ended it.
-        MavbridgeError: it cannot be flown.
-    """
+    """Fly one episode in lockstep with the simulator. See ``FlyJob``."""
     config, usual = spec.config, Delays()
     vision = _delay(usual.vision, config.vision_time)
     delays = replace(
@@ -148,9 +143,7 @@ def identity(config: EvaluateConfig) -> str:
 def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisode]:
     """Return the flights in ``config.json`` by index; none if the file is missing.
 
-    Raises:
-        UserError: it holds other data, more flights than requested, or flights of an identity other
-            than ``flown_by``.
+    Raises UserError unless they are of the identity ``flown_by``, and among those requested.
     """
     path = config.json
     if path is None or not path.exists():

@@ -110,7 +110,7 @@ class ResponseRecording:
         self._states: deque[VehicleState] = deque(maxlen=MAX_ROWS)
 
     def emit(self, event: Event) -> None:
-        """Keep a tick in which the policy flew; see ``mavbridge.core.ports.TickSink``."""
+        """Keep a tick in which the policy flew; see ``mavbridge.core.records.TickSink``."""
         if not isinstance(event, Tick) or event.trace is None:
             return
         # The policy's action after its limits, before any mapping to this vehicle's curves.

@@ -47,11 +47,7 @@ FIGURE_STYLE: dict[Any, Any] = {
 
 
 def require_outputs(json_file: Path | None, plot: Path | None) -> None:
-    """Check the flags ``--json`` and ``--plot`` before a long run.
-
-    Raises:
-        UserError: a file cannot be written or is no picture, or matplotlib is not installed.
-    """
+    """Check the flags ``--json`` and ``--plot`` before a long run; raise UserError."""
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UserError(f"--plot {plot}: name a file that ends in {', '.join(PICTURES)}")
     require_writable(json_file, "--json")

@@ -72,7 +72,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     """Compute a recorded flight again; return an ``ExitCode``."""
     require_outputs(config.json, config.plot)
     source = open_source(folder)
-    source = replace(source, gaps=(*source.gaps, *unrepeatable(source.ticks)))
+    gaps = [*source.gaps, *unrepeatable(source.ticks)]
     require_trusted(source, config)
     wanted = other_config(source.config, config)
     chosen = _source_of(source, config.source, wanted)
@@ -104,10 +104,10 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     if wanted.limits != source.config.limits or not is_same:
         traces = stick_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
-        damage = [text for camera in open_cameras(folder) for text in camera.damage]
-        source = replace(source, gaps=tuple(dict.fromkeys((*source.gaps, *damage))))
+        gaps += [text for camera in open_cameras(folder) for text in camera.damage]
     result = ReplayResult(
         source=source,
+        gaps=tuple(dict.fromkeys(gaps)),
         chosen=chosen,
         engine=engine if compared else None,
         policy=compared,
@@ -119,7 +119,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     )
     if compared and result.problems and not is_stateless(wanted.policy):
         told = forgotten(compared, has_reset=runner.reset is not keep_nothing)
-        result = replace(result, source=replace(source, gaps=(*source.gaps, *told)))
+        result = replace(result, gaps=(*result.gaps, *told))
     print_replay(result, table_console())
     # JSON lacks infinity: only one of the two was flown.
     document = json.loads(json.dumps(as_document(result)), parse_constant=lambda _: None)
@@ -269,6 +269,8 @@ class ReplayResult:
     """Results of one replay."""
 
     source: ReplaySource
+    gaps: tuple[str, ...]
+    """What the recording lacks, in words: the replay may differ there."""
     chosen: ReplayFrom
     engine: str | None
     """Engine of the policy; None: the policy was not used."""
@@ -327,7 +329,7 @@ def print_replay(result: ReplayResult, console: Console) -> None:
     console.print(make_table(title, header, rows, left_columns=2))
     recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
     console.print(recorded + (f", replayed on {result.engine}" if result.engine else ""))
-    for gap in result.source.gaps:
+    for gap in result.gaps:
         console.print(f"note: {gap}", style="yellow")
     past = result.policy.inputs_differ if result.policy and result.tolerance is not None else {}
     for name in filter(past.get, PAST_INPUTS):
@@ -340,7 +342,7 @@ def print_replay(result: ReplayResult, console: Console) -> None:
 
 def _verdict(result: ReplayResult) -> str:
     if not result.is_equal:
-        return "NOT EQUAL, perhaps for the notes above" if result.source.gaps else "NOT EQUAL"
+        return "NOT EQUAL, perhaps for the notes above" if result.gaps else "NOT EQUAL"
     if result.tolerance is None:
         return "the difference is what was asked for"
     if result.tolerance == 0:
@@ -362,7 +364,7 @@ def as_document(result: ReplayResult) -> dict[str, object]:
         "tolerance": result.tolerance,
         "is_equal": result.is_equal,
         "problems": result.problems,
-        "gaps": result.source.gaps,
+        "gaps": result.gaps,
         "policy": None if result.policy is None else asdict(result.policy),
         "guard": asdict(result.guard),
         "sticks": asdict(result.sticks.deviation),

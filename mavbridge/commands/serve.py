@@ -11,10 +11,9 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 
-from rich.text import Text
 from websockets.asyncio.server import Server, ServerConnection
 from websockets.asyncio.server import serve as serve_websockets
 from websockets.exceptions import ConnectionClosed
@@ -27,7 +26,8 @@ from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import stop_signals
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
-from mavbridge.observe.output import MessageQueue, messages_shown, patient_console
+from mavbridge.observe.output import patient_console
+from mavbridge.observe.terminal import MessageScreen
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
 from policy.adapters.websocket.messages import (
@@ -63,14 +63,7 @@ class PolicyServer:
         api_key: str | None,
         report: Callable[[str], None],
     ) -> None:
-        """Prepare; nothing listens yet.
-
-        Args:
-            runner: single-rate policy, called by a thread of its own.
-            clock: measures each call.
-            api_key: key required of clients; None admits all that reach this computer.
-            report: gets a line for each client that connects or leaves; must not block.
-        """
+        """``api_key`` None admits all that reach this computer. ``report`` must not block."""
         self._runner = runner
         self._clock = clock
         self._interface = Interface(contract=runner.contract)
@@ -184,32 +177,30 @@ def serve(config: ServeConfig) -> int:
     """Serve a policy until a signal comes."""
     policy_config = replace(config.policy, dual_rate=False)
     check_configured_policy(policy_config)
-    console, clock = patient_console(stderr=False), MonotonicClock()
-    with (
-        load_configured_policy(policy_config, clock) as loaded,
-        messages_shown(console, JOIN_S) as messages,
-    ):
+    screen, clock = MessageScreen(patient_console(stderr=False)), MonotonicClock()
+    with ExitStack() as stack:
+        loaded = stack.enter_context(load_configured_policy(policy_config, clock))
+        stack.callback(screen.close, JOIN_S)
+        screen.start()
         for note in loaded.notes:
-            messages.put(Text(note, style="yellow"))
+            screen.show_message(note, "yellow")
         server = PolicyServer(
             loaded.runner,
             clock=clock,
             api_key=os.environ.get(API_KEY_VARIABLE) or None,
-            report=lambda line: messages.put(Text(line)),
+            report=screen.show_message,
         )
-        try:
-            asyncio.run(_serve(config, server, messages))
-        finally:
-            server.close()
+        stack.callback(server.close)
+        asyncio.run(_serve(config, server, screen))
     return 0
 
 
-async def _serve(config: ServeConfig, server: PolicyServer, messages: MessageQueue) -> None:
+async def _serve(config: ServeConfig, server: PolicyServer, screen: MessageScreen) -> None:
     for number in stop_signals():
         asyncio.get_running_loop().add_signal_handler(number, server.end)
     listener = await server.listen(config.host, config.port)
     url = f"ws://{spelled(config.host, config.port)}"
-    messages.put(Text(f"serving {config.policy.policy} at {url}; Ctrl-C ends it"))
+    screen.show_message(f"serving {config.policy.policy} at {url}; Ctrl-C ends it")
     if not is_local(config.host):
         who = "every computer that reaches it"
         if os.environ.get(API_KEY_VARIABLE):
@@ -217,7 +208,7 @@ async def _serve(config: ServeConfig, server: PolicyServer, messages: MessageQue
         else:
             who += f": set {API_KEY_VARIABLE} on both sides to keep strangers out"
         told = f"warning: {config.host} is open to {who}; nothing is encrypted"
-        messages.put(Text(told, style="yellow"))
+        screen.show_message(told, "yellow")
     try:
         await asyncio.wrap_future(server.ended)
     finally:

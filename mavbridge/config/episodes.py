@@ -8,8 +8,7 @@ from cyclopts import Parameter
 
 from mavbridge.config.flags import Between, Ranged, check_range
 from mavbridge.config.flight import Limits
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.errors import UserError
 from policy.contract import StateTime
 from policy.nets.names import BUILTIN_KINDS
@@ -106,7 +105,6 @@ class EvaluateConfig(Ranged):
     weights and versions; the file is written anew after each flight."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for values out of range, and for contradictions."""
         super().__post_init__()
         if self.laps > 1 and self.courses != "loop":
             raise UserError("--laps needs --courses loop")
@@ -145,7 +143,6 @@ class DemonstrateConfig(Ranged):
     workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
-        """Raise UserError if the expert could not fly so."""
         super().__post_init__()
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         if self.policy.dual_rate is False:

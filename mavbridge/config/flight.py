@@ -18,8 +18,7 @@ from mavbridge.config.flags import (
     hidden,
     section,
 )
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import OnFault, Risk
 
@@ -133,7 +132,6 @@ class LinkConfig(ListenConfig):
     """Fly in spite of a setting for which a flight is refused."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for ids that MAVLink cannot carry, and parameters that cannot be set."""
         super().__post_init__()
         if self.set_params and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set")
@@ -182,7 +180,6 @@ class CameraConfig(Ranged):
     """Longest time in seconds for which the image may be black or of one colour; 0 = no limit."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for times that no camera has, and for cameras without names."""
         super().__post_init__()
         names = [name for name, _ in self._named]
         if not names:
@@ -260,7 +257,6 @@ class FlyConfig(Ranged):
     """JSON file for the timing report."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for contradictions."""
         super().__post_init__()
         if self.takeoff is not None and not self.arm:
             raise UserError("--takeoff needs --arm: nothing else takes off by itself")

@@ -103,8 +103,7 @@ class Settings(Dict):
     def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
         """See ``Dict``, which leaves out keys with the name of a command, such as ``record``.
 
-        Raises:
-            UserError: a key would be ignored, or taken for another one.
+        Raises UserError for a key that would be ignored, or taken for another one.
         """
         for key, value in self.data.items():
             inner = value if isinstance(value, dict) else {"": value}

@@ -64,12 +64,9 @@ LinkAddress: TypeAlias = UdpAddress | TcpAddress | SerialAddress
 
 
 def parse_address(spec: str) -> LinkAddress:
-    """Parse the address of ``--connect`` without looking up any name.
+    """Parse the address of ``--connect`` without looking up any name; raise UserError.
 
     A bare HOST:PORT listens, as in pymavlink.
-
-    Raises:
-        UserError: the address is not understood; the message lists the accepted forms.
     """
     if (serial := _serial(spec)) is not None:
         return serial
@@ -117,11 +114,7 @@ def spelled(host: str, port: int, *scope: int) -> str:
 
 
 def resolve(host: str, port: int) -> SocketAddress:
-    """Resolve a host, preferring IPv4. Call once at the start: a resolver may block.
-
-    Raises:
-        UserError: the host or network interface does not exist.
-    """
+    """Resolve a host, preferring IPv4, or raise UserError. Call once: a resolver may block."""
     try:
         found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
     except (OSError, UnicodeError) as error:

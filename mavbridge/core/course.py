@@ -99,13 +99,10 @@ def _offset_m(gate: CourseGate, position: Position) -> tuple[float, float, float
 
 
 def read_gates(path: Path) -> tuple[CourseGate, ...]:
-    """Read gates, in flight order, from JSON.
+    """Read gates, in flight order, from JSON; raise UserError for another format.
 
     The format is that of ``python -m sitl course --json``: a list ``gates`` of objects with
     ``center_ned_m`` (north, east, down from the estimator's origin), ``yaw_rad`` and ``size_m``.
-
-    Raises:
-        UserError: the file cannot be read or has another format.
     """
     try:
         document: Any = read_json(path)

@@ -22,7 +22,7 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.workers import HungError, Worker
+from mavbridge.core.stopping import HungError, Worker
 
 SAID = "mavbridge.said"
 THREAD = "mavbridge-log"

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Generic, Protocol, TypeVar
 
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Event, Observed, Solve, Tick
+from mavbridge.core.records import Event, Observed, Solve, Tick, TickSink
 
 BATCH_PERIOD_S = 0.1
 """Time between batches. The queue is polled: waking a thread from ``emit`` would cost the loop a

@@ -88,16 +88,6 @@ def end(process: subprocess.Popen[bytes]) -> None:
         process.wait(END_TIMEOUT_S)
 
 
-def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: float) -> None:
-    """Wait for a process to end; raise UserError with the end of its log if it fails to."""
-    try:
-        status = process.wait(timeout_s)
-    except subprocess.TimeoutExpired as error:
-        raise UserError(f"{name} has not ended after {timeout_s:g} s: {log_tail(log)}") from error
-    if status != 0:
-        raise UserError(f"{name} failed with status {status}: {log_tail(log)}")
-
-
 def log_tail(log: Path) -> str:
     """Return the last lines of a log, for an error message."""
     lines = log.read_text(errors="replace").strip().splitlines()

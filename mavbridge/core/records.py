@@ -1,4 +1,5 @@
-"""Values that travel between components: frozen, with units and frames in their names.
+"""Values that travel between components: frozen, with units and frames in their names; and the
+protocols of the cameras that make them and the sinks that take them.
 
 Stamps are nanoseconds of the injected clock, taken at the source (exposure, datagram arrival).
 Arrays are read-only once they are published here.
@@ -6,7 +7,7 @@ Arrays are read-only once they are published here.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,3 +256,28 @@ Event: TypeAlias = Tick | VisionTick
 """Events that the loops report to every observer."""
 Observed: TypeAlias = Event | Solve
 """Events that the recorder and the viewer take in addition."""
+
+
+class Camera(Protocol):
+    """Video source, opened by its constructor and used by one thread."""
+
+    @property
+    def dropped_frames(self) -> int:
+        """Number of frames that were delivered and not read, since the source was opened."""
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """Return the newest frame not returned before; None if none arrives within the timeout.
+
+        Raises:
+            CameraError: the source has died and will not recover by itself.
+        """
+
+    def close(self) -> None:
+        """Free the source and join its thread. May be called twice."""
+
+
+class TickSink(Protocol):
+    """Receiver of events. Must never block and never raise."""
+
+    def emit(self, event: Event) -> None:
+        """Take the event, or drop and count it."""

@@ -13,19 +13,17 @@ from rich.text import Text
 
 from mavbridge.camera.open import open_camera
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import STATUS_HZ
+from mavbridge.config.policy import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
-from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle_thread
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import FlightOutcome
-from mavbridge.core.stopping import StopRequest, stop_on_signals
+from mavbridge.core.records import Camera, FlightOutcome, TickSink
+from mavbridge.core.stopping import HungError, StopRequest, Worker, stop_on_signals
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, output_folders, signing_note
 from mavbridge.flight.feature_cache import FeatureCache

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import Clock, period_ns
 from mavbridge.core.observers import FanOut
-from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Solve
+from mavbridge.core.records import Camera, Solve, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import FlightPlan

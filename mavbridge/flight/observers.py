@@ -15,7 +15,6 @@ from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import as_json
 from mavbridge.core.observers import ObserverThread
-from mavbridge.core.ports import TickSink
 from mavbridge.core.provenance import (
     command_line,
     digests,
@@ -23,7 +22,7 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.records import FlightOutcome, Solve
+from mavbridge.core.records import FlightOutcome, Solve, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.guard_process import GuardProcess
@@ -139,7 +138,7 @@ class FlightObservers:
             return
         from mavbridge.recording.folder import FlightMeta
         from mavbridge.recording.recorder import Recorder
-        from mavbridge.recording.settings import ReplaySettings
+        from mavbridge.recording.replay_files import ReplaySettings
 
         start_ns, offset_ns = self._clock.now_ns(), self._wall_offset_ns
         meta = FlightMeta(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import LoopRates
+from mavbridge.config.policy import LoopRates
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.flight.settings import (
     TAU_S,

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable
 from itertools import groupby
 
 from mavbridge.core.clock import NS_PER_S, Clock
-from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Position, Solve, Tick, VehicleState
+from mavbridge.core.records import Position, Solve, Tick, TickSink, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory

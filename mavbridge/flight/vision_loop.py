@@ -5,9 +5,15 @@ from collections.abc import Callable
 
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import NS_PER_MS, Clock
-from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import CameraImage, FeatureFrame, FloatArray, VisionTick
+from mavbridge.core.records import (
+    Camera,
+    CameraImage,
+    FeatureFrame,
+    FloatArray,
+    TickSink,
+    VisionTick,
+)
 from mavbridge.flight.feature_cache import FeatureCache
 from policy.errors import NoChunkError
 

@@ -8,7 +8,7 @@ import termios
 import threading
 from collections.abc import Callable, Sequence
 
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 
 ENGAGE_KEY, RELEASE_KEY = "e", "q"
 FLIGHT_KEYS = (RELEASE_KEY, ENGAGE_KEY)

@@ -5,10 +5,9 @@ import io
 import os
 import select
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TextIO, cast
 
@@ -17,7 +16,6 @@ from rich.segment import Segment
 from rich.text import Text
 
 from mavbridge.core.provenance import printable
-from mavbridge.core.workers import HungError, Worker
 
 POLL_S = 0.05
 """Interval at which a stalled write checks whether it was given up."""
@@ -213,30 +211,3 @@ def _is_same_file(stream: TextIO | None, other: IO[str]) -> bool:
         return stream is not None and os.path.sameopenfile(stream.fileno(), other.fileno())
     except (OSError, ValueError, AttributeError):  # closed, in memory, or a policy's own stream
         return False
-
-
-@contextmanager
-def messages_shown(console: Console, timeout_s: float) -> Iterator[MessageQueue]:
-    """Context manager: print messages, and stray lines, on a thread of their own.
-
-    At the end the reader has ``timeout_s`` to take the rest.
-    """
-    messages = MessageQueue()
-
-    def show(stop: threading.Event) -> None:
-        while not stop.wait(POLL_S):
-            messages.print_to(console)
-        messages.print_to(console)
-
-    worker, output = Worker("mavbridge-terminal", show), console.file
-    worker.start()
-    is_patient = isinstance(output, PatientOutput)
-    stray = stray_lines_shown(lambda line: messages.put(Text(line, style="dim")), output)
-    try:
-        with stray if is_patient else nullcontext():
-            yield messages
-    finally:
-        with suppress(HungError):
-            worker.join(timeout_s)
-        if isinstance(output, PatientOutput):
-            output.give_up()

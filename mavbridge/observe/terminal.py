@@ -11,13 +11,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from mavbridge.config.rates import STATUS_HZ
+from mavbridge.config.policy import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.log import SAID, is_log_thread
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import Event, Tick
+from mavbridge.core.stopping import HungError, Worker
 from mavbridge.core.vehicle import LinkStats
-from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
 from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_shown
 from mavbridge.observe.timing import TimingReport
@@ -60,46 +60,23 @@ class RateMeter:
         return (last - first) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else None
 
 
-class FlightScreen:
-    """``TickSink`` that shows a status line and a final table on one console.
+class MessageScreen:
+    """Shows messages, and what else this process prints, on one console.
 
     Between ``start`` and ``close`` only the screen's own thread writes to the console. A stalled
     reader (Ctrl-S, a pipe that nothing empties) blocks only that thread. All methods return at
-    once, except for ``close``, which has a deadline. They can be called by any thread, but all
-    ticks must come from one thread, and all vision ticks from one thread.
+    once, except for ``close``, which has a deadline. They can be called by any thread.
     """
 
-    def __init__(
-        self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
-    ) -> None:
-        """Show a flight on ``console``; a real flight uses a ``patient_console``."""
+    def __init__(self, console: Console) -> None:
+        """Show messages on ``console``, for a stalled reader a ``patient_console``."""
         self._console = console
-        self._target_hz = (action_hz, vision_hz)
-        self._readonly = readonly
-        self._hint: str | None = None
-        self._action, self._vision = RateMeter(), RateMeter()
-        self._tick: Tick | None = None
-        self._missed_slots = 0
-        self._activity_ns = 0
-        self._stage: tuple[object, ...] = ()
         self._messages = MessageQueue()
-        self._refreshes = 0
-        # Not Live's own redirection: any printing thread would wait for the console's lock.
-        self._live = Live(
-            console=console,
-            auto_refresh=False,
-            transient=True,
-            redirect_stdout=False,
-            redirect_stderr=False,
-        )
         self._worker: Worker | None = None
         self._redirection = ExitStack()
 
-    def start(self, *, hint: str | None = None) -> None:
-        """Start the display. ``hint`` names the keys and their actions; None: no keys."""
-        self._hint = hint
-        if hint is not None and not self._console.is_terminal:
-            self.show_message(hint)
+    def start(self) -> None:
+        """Start the display."""
         output = self._console.file
         if isinstance(output, PatientOutput):
             self._redirection.enter_context(stray_lines_shown(self._show_stray, output))
@@ -126,6 +103,58 @@ class FlightScreen:
                 self._console.file.give_up()
                 worker.ends_within(timeout_s)
 
+    def show_message(self, text: str, style: str = "") -> None:
+        """Log a message now, and show it with the next refresh."""
+        _said.info("%s", text)
+        self._messages.put(Text(without_secrets(text), style=style))
+
+    def _show_stray(self, text: str) -> None:
+        """Show a line printed elsewhere in the process; lines of the log are already logged."""
+        if not is_log_thread():
+            _said.info("%s", text)
+        self._messages.put(Text(without_secrets(text), style="dim"))
+
+    def _run(self, stop: threading.Event) -> None:
+        while not stop.wait(1 / STATUS_HZ):
+            self._messages.print_to(self._console)
+        self._messages.print_to(self._console)
+
+
+class FlightScreen(MessageScreen):
+    """``TickSink`` that also shows a status line and a final table.
+
+    All ticks must come from one thread, and all vision ticks from one thread.
+    """
+
+    def __init__(
+        self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
+    ) -> None:
+        super().__init__(console)
+        self._target_hz = (action_hz, vision_hz)
+        self._readonly = readonly
+        self._hint: str | None = None
+        self._action, self._vision = RateMeter(), RateMeter()
+        self._tick: Tick | None = None
+        self._missed_slots = 0
+        self._activity_ns = 0
+        self._stage: tuple[object, ...] = ()
+        self._refreshes = 0
+        # Not Live's own redirection: any printing thread would wait for the console's lock.
+        self._live = Live(
+            console=console,
+            auto_refresh=False,
+            transient=True,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        )
+
+    def start(self, *, hint: str | None = None) -> None:
+        """Start the display. ``hint`` names the keys and their actions; None: no keys."""
+        self._hint = hint
+        if hint is not None and not self._console.is_terminal:
+            self.show_message(hint)
+        super().start()
+
     def emit(self, event: Event) -> None:
         """Store the event and its messages."""
         if not isinstance(event, Tick):
@@ -149,17 +178,6 @@ class FlightScreen:
                 return
         self._stage, self._activity_ns = tick.stage, tick.woke_ns
         self.show_message(tick.activity)
-
-    def show_message(self, text: str) -> None:
-        """Log a message now, and show it with the next refresh."""
-        _said.info("%s", text)
-        self._messages.put(Text(without_secrets(text)))
-
-    def _show_stray(self, text: str) -> None:
-        """Show a line printed elsewhere in the process; lines of the log are already logged."""
-        if not is_log_thread():
-            _said.info("%s", text)
-        self._messages.put(Text(without_secrets(text), style="dim"))
 
     def show_report(self, report: TimingReport) -> None:
         """Show the table of measurements and the verdicts with the next refresh."""

@@ -1,7 +1,7 @@
 """Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
 from dataclasses import asdict, dataclass, fields
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
@@ -265,31 +265,61 @@ class _Sticks:
         )
 
 
+class FlownChunk(NamedTuple):
+    """Computation of a chunk that was flown."""
+
+    serial: int
+    started_ns: int
+    computed_ns: int
+    attitude_ns: int | None
+
+
+class FlownChunks:
+    """Finds each chunk by the tick that flew it first, within each stretch of flight."""
+
+    def __init__(self) -> None:
+        self._last: FlownChunk | None = None
+
+    def add(self, tick: Tick) -> tuple[FlownChunk | None, FlownChunk | None]:
+        """Return the tick's chunk if it is new, and the one before if that was computed before."""
+        last, self._last = self._last, None
+        if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
+            return None, None
+        newest = self._last = FlownChunk(
+            serial=tick.chunk_serial,
+            started_ns=tick.chunk_computed_ns - (tick.predict_ns or 0),
+            computed_ns=tick.chunk_computed_ns,
+            attitude_ns=None if tick.state is None else tick.state.attitude_ns,
+        )
+        if last is None:
+            return newest, None
+        if last.serial == newest.serial:
+            self._last = last
+            return None, None
+        return newest, last if last.serial < newest.serial else None
+
+
 class _Chunks:
-    """Statistics of chunks by the tick that flew them first, within each stretch of flight."""
+    """Statistics of the flown chunks."""
 
     def __init__(self, target_hz: float) -> None:
         self._target_hz = target_hz
         self._late_ns = round(LATE_PERIODS * NS_PER_S / target_hz)
-        self._last: tuple[int, int] | None = None
+        self._flown = FlownChunks()
         self._chunks = self._late = self._intervals = self._span_ns = 0
         self._period, self._predict = Histogram(), Histogram()
 
     def add(self, tick: Tick) -> None:
-        if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
-            self._last = None
+        newest, last = self._flown.add(tick)
+        if newest is None:
             return
-        newest, last = (tick.chunk_serial, tick.chunk_computed_ns), self._last
-        if last is not None and last[0] == newest[0]:
-            return
-        self._last = newest
         self._chunks += 1
         if tick.predict_ns is not None:
             self._predict.add(tick.predict_ns)
-        if last is None or newest[0] < last[0]:
+        if last is None:
             return
         # A chunk overtaken by a newer one before any send was computed in time nevertheless.
-        count, span_ns = newest[0] - last[0], newest[1] - last[1]
+        count, span_ns = newest.serial - last.serial, newest.computed_ns - last.computed_ns
         self._intervals += count
         self._span_ns += span_ns
         self._period.add(span_ns // count)

@@ -39,18 +39,10 @@ class RerunView:
     """
 
     def __init__(self, target: str, flight: ViewedFlight, *, is_live: bool = False) -> None:
-        """Check the target, and start the viewer if it is to be spawned.
+        """Ready the target, as ``prepare_target`` does; ``consume`` and ``close`` alone can block.
 
-        Calls that can block are left to ``consume`` and ``close``.
-
-        Args:
-            target: that of ``prepare_target``.
-            flight: facts known before the flight.
-            is_live: a file is opened, and an older one replaced, only once the vehicle is heard.
-                False: a recording, whose images have no start of encoding and no count of drops.
-
-        Raises:
-            MavbridgeError: as in ``prepare_target``.
+        ``is_live``: a file is opened, and an older one replaced, only once the vehicle is heard.
+        Otherwise it is a recording, whose images have no start of encoding and no count of drops.
         """
         self._flight = flight
         prepared = prepare_target(target)
@@ -105,11 +97,7 @@ class RerunView:
             self._columns.flush()
 
     def close(self) -> None:
-        """Deliver the rest, and block until it is taken.
-
-        Raises:
-            MavbridgeError: the viewer is gone, or the disk is full.
-        """
+        """Deliver the rest and block until it is taken; raise MavbridgeError if it was not."""
         if self._awaits_vehicle:
             return
         self._open()

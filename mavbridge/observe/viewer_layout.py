@@ -101,22 +101,13 @@ BANDS = (
 _COUNTS = (Series("0.1 % of all", RED), Series("count", BLUE, width=2))
 MISSED = Plot("missed/sticks", "Missed slots since the start, red: 0.1 % of all", _COUNTS)
 DROPPED = Plot("missed/vision", "Dropped images since the start, red: 0.1 % of all", _COUNTS)
-STICK_COLORS: dict[str, Rgb] = {"roll": GREY, "pitch": DARK_BLUE, "throttle": ORANGE, "yaw": BLUE}
-"""The four colours above that differ most for all kinds of colour vision."""
-_RC_SERIES = tuple(
-    Series(f"channel {number}", color)
-    for number, color in enumerate(STICK_COLORS.values(), start=1)
-)
-RC = Plot("rc", "RC channels [us]: 1 grey, 2 dark blue, 3 orange, 4 light blue", _RC_SERIES)
-"""Channels as the vehicle echoes them. Channels 1 to 4 hold roll, pitch, throttle and yaw, unless
-RCMAP_* differs."""
 SPEED = Plot(
     "motion/speed",
     "Speed [m/s]: blue horizontal, green climb",
     (Series("horizontal", BLUE, 2), Series("climb", GREEN, 2)),
 )
 HEIGHT = Plot("motion/height", "Height above the origin [m]", (Series("height", BLUE, 2),))
-PLOTS = (*BANDS, MISSED, DROPPED, RC, SPEED, HEIGHT)
+PLOTS = (*BANDS, MISSED, DROPPED, SPEED, HEIGHT)
 
 ACTION_SERIES = (
     Series("vehicle's echo", GREEN, width=4),  # first, so that the others are drawn on top
@@ -251,7 +242,7 @@ def _behind(position_m: tuple[float, float, float]) -> rrb.EyeControls3D:
 def timing_page() -> rrb.Horizontal:
     """Return the page ``Timing``: every age, period and count beside its limit, and the events."""
     columns = (
-        (IMAGE_AGE, ATTITUDE_AGE, RC),
+        (IMAGE_AGE, ATTITUDE_AGE),
         (LATENESS, CHUNK_PERIOD, PREDICT, MISSED),
         (VISION_JITTER, VISION_PERIOD, ENCODE, DROPPED),
     )

@@ -15,6 +15,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick, VisionTick
 from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.observe import viewer_layout as layout
+from mavbridge.observe.timing import FlownChunks
 from mavbridge.observe.viewer_layout import Plot, ViewedFlight
 
 WINDOW_NS = NS_PER_S // 4
@@ -116,10 +117,8 @@ class TimingPlots:
         self._spreads = {
             plot: Spread(columns, plot, bound_ns) for plot, bound_ns in bounds_ns.items()
         }
-        self._last_chunk: tuple[int, int] | None = None
-        """Serial and end of the computation."""
+        self._chunks = FlownChunks()
         self._last_started_ns: int | None = None
-        self._last_channels: tuple[int, ...] | None = None
         self._missed_slots = self._images = 0
         self._first_dropped: int | None = None
 
@@ -147,33 +146,18 @@ class TimingPlots:
         last_ns = ticks[-1].woke_ns
         slots = (last_ns - self._columns.start_ns) / self._slot_ns
         self._count(layout.MISSED, last_ns, self._missed_slots, slots)
-        self._show_channels(ticks)
 
     def _show_chunks(self, ticks: Sequence[Tick]) -> None:
         """Plot the periods and the computing times of the flown chunks."""
         for tick in ticks:
-            last, self._last_chunk = self._last_chunk, None  # without a chunk there is no period
-            if tick.chunk_serial is None or tick.chunk_computed_ns is None:
-                continue
-            newest = self._last_chunk = (tick.chunk_serial, tick.chunk_computed_ns)
-            if last is not None and (count := newest[0] - last[0]) > 0:
+            newest, last = self._chunks.add(tick)
+            if newest is not None and last is not None:
                 # Also counts chunks that a newer one overtook before any send, as the report does.
-                period_ns = (newest[1] - last[1]) // count
+                span_ns = newest.computed_ns - last.computed_ns
+                period_ns = span_ns // (newest.serial - last.serial)
                 self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
-            is_new = last is None or newest[0] != last[0]
-            if is_new and tick.predict_ns is not None:
+            if newest is not None and tick.predict_ns is not None:
                 self._spreads[layout.PREDICT].extend([(tick.sent_ns, tick.predict_ns)])
-
-    def _show_channels(self, ticks: Sequence[Tick]) -> None:
-        width = len(layout.RC.series)
-        rows: list[tuple[int, tuple[float, ...]]] = []
-        for tick in ticks:
-            if tick.rc_channels_us != self._last_channels or tick is ticks[-1]:
-                self._last_channels = tick.rc_channels_us
-                shown_us = tick.rc_channels_us[:width]
-                rows.append((tick.woke_ns, (*shown_us, *(math.nan,) * (width - len(shown_us)))))
-        stamps_ns, values_us = zip(*rows, strict=True)
-        self._columns.plot(layout.RC, stamps_ns, values_us)
 
     def show_visions(self, visions: Sequence[VisionTick]) -> None:
         """Plot the images of one camera; of a recording, only their periods."""

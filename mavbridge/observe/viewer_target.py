@@ -27,13 +27,7 @@ _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 def prepare_target(text: str) -> Path | str:
     """Return the file that a recording is written to, or the URL of a listening viewer.
 
-    Args:
-        text: ``spawn``, ``connect``, ``connect=URL`` or a path that ends in ``.rrd``.
-
-    Raises:
-        UserError: an unknown form, a malformed URL, or a path that cannot be written.
-        PeerError: nothing listens at the URL.
-        MavbridgeError: the viewer does not start.
+    Starts one for ``spawn``; raises as ``check_target`` does, or if that one does not start.
     """
     check_target(text)
     if text.endswith(".rrd"):

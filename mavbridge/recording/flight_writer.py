@@ -9,7 +9,7 @@ import pyarrow as pa
 from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Solve, Tick, VisionTick
 from mavbridge.core.vehicle import Action, ForwardedPacket
-from mavbridge.recording import replay_tables, rows
+from mavbridge.recording import replay_files, rows
 from mavbridge.recording.folder import (
     PACKETS,
     SOLVES,
@@ -77,13 +77,8 @@ class FlightWriter:
     ) -> None:
         """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
-        Args:
-            folder: the flight's folder.
-            meta: the facts known at the start.
-            pressure: "offline" waits and drops nothing; see ``VideoWriter``.
-            with_labels: the tables have the columns of the expert and of ``FrameTruth``.
-            with_replay: the folder also has the tables for a replay.
-            tlog_pipe: its reader becomes ``link.tlog`` and is closed here; None: no such file.
+        ``with_labels`` adds columns for the expert and ``FrameTruth``, ``with_replay`` the tables
+        for a replay. The reader of ``tlog_pipe`` becomes ``link.tlog`` and is closed here.
         """
         self._folder = folder
         self.meta = meta
@@ -122,11 +117,11 @@ class FlightWriter:
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
         self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
-        self._solves = self._table(SOLVES, replay_tables.SOLVES) if with_replay else None
-        self._packets = self._table(PACKETS, replay_tables.PACKETS) if with_replay else None
+        self._solves = self._table(SOLVES, replay_files.SOLVES) if with_replay else None
+        self._packets = self._table(PACKETS, replay_files.PACKETS) if with_replay else None
         if with_replay and self.meta.mode == "dual":  # else features are only resized images
             for camera in self._cameras:
-                camera.features = self._table(features_of(camera.name), replay_tables.FEATURES)
+                camera.features = self._table(features_of(camera.name), replay_files.FEATURES)
 
     def _table(self, stem: str, schema: pa.Schema) -> TableWriter:
         table = TableWriter(self._folder / stem, schema)
@@ -146,7 +141,7 @@ class FlightWriter:
         camera = self._cameras[vision.camera]
         dropped = camera.serials.take(vision.serial)
         if camera.features is not None and vision.feature is not None:
-            camera.features.add(replay_tables.feature_columns(vision, vision.feature, dropped))
+            camera.features.add(replay_files.feature_columns(vision, vision.feature, dropped))
         self._flush_if_due(vision.ready_ns)
         if vision.camera == 0 and self._source_size is None:
             self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
@@ -173,7 +168,7 @@ class FlightWriter:
         """Record a solve for a replay. Skipped serial numbers count as dropped."""
         if self._solves is not None:
             self._solves.add(
-                replay_tables.solve_columns(solve, self._solve_serials.take(solve.serial))
+                replay_files.solve_columns(solve, self._solve_serials.take(solve.serial))
             )
             self._flush_if_due(solve.computed_ns)
 
@@ -187,7 +182,7 @@ class FlightWriter:
         if self._packets is not None:
             for packet in self.packets.take():
                 skipped = self._packet_serials.take(self._packets.rows + self._packets_dropped)
-                self._packets.add(replay_tables.packet_columns(packet, skipped))
+                self._packets.add(replay_files.packet_columns(packet, skipped))
             self._packets_dropped = self.packets.dropped  # behind those: the queue was full
         for table in self._tables:
             table.flush()

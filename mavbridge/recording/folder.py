@@ -31,7 +31,7 @@ EXTRA = ("av", "pyarrow")
 """Packages of the ``record`` extra."""
 FORMAT = "mavbridge-flight"
 VERSION = 1
-FlightSource = Literal["flight", "demonstration", "dagger", "imagined", "pilot"]
+FlightSource = Literal["flight", "demonstration", "dagger", "pilot"]
 
 
 def video_of(camera: str | None) -> str:
@@ -55,11 +55,7 @@ def require_extra(what: str) -> None:
 
 
 def prepare_folder(folder: Path, flag: str) -> None:
-    """Create the folder that a flag names and check that a flight can be recorded into it.
-
-    Raises:
-        UserError: the extra is not installed, or the folder is not empty or cannot be written.
-    """
+    """Create the folder that a flag names; raise UserError if no flight can be recorded into it."""
     require_extra(flag)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -235,8 +231,13 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
     if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
         raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
-    for name in ("start_ns", "action_hz", "visual_hz"):
+    for name in ("action_hz", "visual_hz"):
         value = getattr(meta, name)
-        if not isinstance(value, int | float) or not math.isfinite(value):
-            raise FlightError(f"{folder / META}: {name} is {value!r}, not a number")
+        if not (isinstance(value, int | float) and 0 < value < math.inf):  # also of NaN
+            raise FlightError(f"{folder / META}: {name} is {value!r}, not a rate above zero")
+    counts = ("course_seed", "ticks_dropped", "frames_dropped", "packets_dropped")
+    for name in ("start_ns", *(each for each in counts if getattr(meta, each) is not None)):
+        value = getattr(meta, name)
+        if not (isinstance(value, int) and value >= 0):
+            raise FlightError(f"{folder / META}: {name} is {value!r}, not a whole number")
     return meta

@@ -17,7 +17,7 @@ from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import ForwardedPacket, VehicleText, recorded_text
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
-from mavbridge.recording.settings import ReplaySettings, write_settings
+from mavbridge.recording.replay_files import ReplaySettings, write_settings
 from mavbridge.recording.tlog import TlogPipe
 from policy.contract import QUATERNION
 
@@ -56,19 +56,10 @@ class Recorder(ObserverThread):
         report: Callable[[str], None],
         settings: ReplaySettings | None = None,
     ) -> None:
-        """Create the files, start the writer process and the thread.
+        """Create the files, start the writer process and the thread; raise OSError, WriterError.
 
-        Args:
-            folder: from ``prepare_folder``.
-            meta: the facts known at the start.
-            tlog_pipe: filled by the link's process; its reader is closed here.
-            packets_dropped: returns how many packets that process has dropped; exact at the end.
-            autopilot: returns the autopilot's name at the end.
-            report: shows a line to the user; called from the recorder's thread.
-            settings: the flight's settings, for a replay; None: the flight cannot be replayed.
-
-        Raises:
-            OSError, WriterError: the folder is not writable, or the writer process fails.
+        ``packets_dropped`` and ``autopilot`` are asked at the end; ``report`` shows a line to the
+        user, from the recorder's thread. Without ``settings`` the flight cannot be replayed.
         """
         self._folder = folder
         writer = FlightWriter(

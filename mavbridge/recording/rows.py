@@ -154,11 +154,7 @@ def attributes(source: object | None, names: Iterable[str]) -> Row:
 
 
 def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
-    """Return the records of a table of ticks whose actions are of this kind.
-
-    Raises:
-        FlightError: a part of a state or of an action is missing.
-    """
+    """Return the records of a table of ticks whose actions are of this kind."""
     for whole, parts in (("state", STATE_STAMPS), ("raw", ActionTrace._fields)):
         there = table.filter(table[whole].is_valid())
         if torn := [name for name in parts if there[name].null_count]:

@@ -7,12 +7,11 @@ import cv2
 import numpy as np
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX
+from mavbridge.config.policy import SIM_CAMERA_HZ, SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import CameraImage
+from mavbridge.core.records import CameraImage, TickSink
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mavbridge.config.episodes import ConditionsKind
-from mavbridge.core.ports import TickSink
-from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, VisionTick
+from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, TickSink, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel

@@ -16,7 +16,7 @@ import numpy as np
 
 from mavbridge.camera.grabber import Image, ImageSource
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 
 HEADER = Struct("<IHHIIQ")
 """From the description of the format, independent of the tested code."""

@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 from mavbridge.commands.serve import PolicyServer
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 from policy.adapters.websocket.messages import Message, pack, unpack
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner

@@ -74,16 +74,13 @@ class Bench:
         self.transport.send = log  # type: ignore[method-assign]
         return sent
 
-    def check(
-        self, *, contract: Contract | None = None, echo_test: bool = False, **link: Any
-    ) -> dict[str, CheckRow]:
+    def check(self, *, contract: Contract | None = None, **link: Any) -> dict[str, CheckRow]:
         """The rows by their names."""
         config = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:1", **link))
         rows = check_vehicle(
             config,
             None if contract is None else plan_flight(config, contract, is_dual=True),
             self.clock,
-            echo_test=echo_test,
             transport=self.transport,
         )
         return {row.name: row for row in rows}
@@ -96,13 +93,12 @@ def verdicts(rows: dict[str, CheckRow]) -> dict[str, str]:
 
 def test_an_ardupilot_that_is_set_up_is_a_go() -> None:
     bench = Bench(params=SAFE)
-    rows = bench.check(contract=Contract(), echo_test=True)
+    rows = bench.check(contract=Contract())
 
     assert "no-go" not in verdicts(rows).values(), verdicts(rows)
     assert rows["RC_OVERRIDE_TIME"].found == "0.5"
     assert rows["modes"].found == "ALT_HOLD"
     assert rows["radio receiver"].verdict == "go"
-    assert rows["echo test"].found == "taken, and released"
     assert rows["clocks (TIMESYNC)"].verdict == "go"
     for name in ("attitude", "velocity", "acceleration"):
         assert float(rows[name].found.split()[0]) == pytest.approx(100, abs=2)
@@ -111,7 +107,7 @@ def test_an_ardupilot_that_is_set_up_is_a_go() -> None:
 @pytest.mark.parametrize("receiver_us", [MID_RECEIVER_US, None])
 def test_a_px4_is_told_what_its_sticks_cannot_do(receiver_us: tuple[int, ...] | None) -> None:
     bench = Bench("px4", receiver_us=receiver_us, params={"COM_RC_IN_MODE": 1})
-    rows = bench.check(contract=Contract(), echo_test=True)
+    rows = bench.check(contract=Contract())
 
     assert "no-go" not in verdicts(rows).values(), verdicts(rows)
     assert rows["modes"].found == "ALTCTL"
@@ -119,7 +115,6 @@ def test_a_px4_is_told_what_its_sticks_cannot_do(receiver_us: tuple[int, ...] | 
     assert "sticks are mapped" in rows["full lean"].found
     assert rows["full yaw rate"].verdict == "warn"
     assert "202 deg/s" in rows["full yaw rate"].advice
-    assert rows["echo test"].found == "taken, and released"
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
@@ -152,13 +147,6 @@ def test_what_a_flight_refuses_is_a_no_go_and_its_flag_mends_it(
     assert bench.vehicle.params[name] == value, "nothing was set"
 
 
-def test_an_echo_that_needs_set_is_no_no_go() -> None:
-    bench = Bench(params=SAFE | {"RC2_MIN": 700})
-    row = bench.check(contract=Contract(), set=("RC2_MIN=800",), echo_test=True)["echo test"]
-    assert (row.verdict, row.commands) == ("warn", ())
-    assert "only after --set" in row.advice
-
-
 def test_without_a_receiver_its_failsafes_count() -> None:
     bench = Bench(receiver_us=None, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
     rows = bench.check(contract=Contract())
@@ -167,9 +155,6 @@ def test_without_a_receiver_its_failsafes_count() -> None:
     assert rows["FS_OPTIONS"].commands == ("--set FS_OPTIONS=24",)
     accepted = bench.check(contract=Contract(), accept_risk=("no-throttle-failsafe",))
     assert accepted["FS_THR_ENABLE"].verdict == "warn"
-    bench.check(contract=Contract(), echo_test=True)  # its sticks stay, and look like a receiver
-    bench.clock.sleep_until_ns(bench.clock.now_ns() + 5 * NS_PER_S)
-    assert bench.check(contract=Contract())["FS_THR_ENABLE"].verdict == "no-go"
     seen = Bench(params=SAFE | {"FS_THR_ENABLE": 0}).check(contract=Contract())
     assert seen["radio receiver"].verdict == "go"
 
@@ -198,7 +183,7 @@ def test_only_sticks_that_end_give_the_vehicle_to_the_receiver(
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_policy_of_setpoints_has_parameters_of_its_own(autopilot: AutopilotName) -> None:
-    rows = Bench(autopilot).check(contract=Contract(action="rates"), echo_test=True)
+    rows = Bench(autopilot).check(contract=Contract(action="rates"))
     timeout, mode = {"ardupilot": ("GUID_TIMEOUT", "GUIDED"), "px4": ("COM_OF_LOSS_T", "OFFBOARD")}[
         autopilot
     ]
@@ -206,24 +191,28 @@ def test_a_policy_of_setpoints_has_parameters_of_its_own(autopilot: AutopilotNam
     assert mode in rows["modes"].found
     assert "hover thrust" in rows
     assert "full lean" not in rows
-    assert rows["echo test"].verdict == "go"
-    assert rows["echo test"].found.startswith("not sent")
 
 
-def test_a_vehicle_that_obeys_another_system_fails_the_echo_test() -> None:
-    rows = Bench(params={"MAV_GCS_SYSID": 42}).check(echo_test=True)
-    for name in ("echo test", "MAV_GCS_SYSID"):
-        assert rows[name].verdict == "no-go"
-        assert "--set-config link.source_system=42" in rows[name].commands
+def test_a_vehicle_that_obeys_another_system_is_a_no_go_with_its_flag() -> None:
+    row = Bench(params={"MAV_GCS_SYSID": 42}).check()["MAV_GCS_SYSID"]
+    assert row.verdict == "no-go"
+    assert "--set-config link.source_system=42" in row.commands
+
+
+def test_an_armed_vehicle_is_a_warning() -> None:
+    bench = Bench(params=SAFE)
+    bench.clock.sleep_until_ns(bench.clock.now_ns() + 3 * NS_PER_S)
+    bench.arm()
+    assert bench.check()["state"].verdict == "warn"
 
 
 def test_a_vehicle_that_answers_nothing_is_one_no_go() -> None:
-    rows = Bench(params={"MAV_OPTIONS": 1, "MAV_GCS_SYSID": 42}).check(echo_test=True)
+    rows = Bench(params={"MAV_OPTIONS": 1, "MAV_GCS_SYSID": 42}).check()
     assert [name for name, verdict in verdicts(rows).items() if verdict == "no-go"] == ["vehicle"]
     assert "MAV_OPTIONS bit 0" in rows["vehicle"].advice
 
 
-def test_without_the_flag_nothing_is_sent_but_requests() -> None:
+def test_nothing_is_sent_but_requests() -> None:
     bench = Bench(params=SAFE)
     sent = bench.log_sent()
     bench.check(contract=Contract())
@@ -231,31 +220,6 @@ def test_without_the_flag_nothing_is_sent_but_requests() -> None:
     assert not messages & {69, OVERRIDE, 82, 84, 23, 253}, "nothing that moves, sets or announces"
     commands = [int.from_bytes(data[38:40], "little") for _, data in sent if data[7] == 76]
     assert set(commands) <= {511, 512}, "message rates and the version alone"
-
-
-def test_an_armed_vehicle_is_not_touched_by_the_echo_test() -> None:
-    bench = Bench(params=SAFE)
-    bench.clock.sleep_until_ns(bench.clock.now_ns() + 3 * NS_PER_S)
-    bench.arm()
-    rows = bench.check(echo_test=True)
-    assert rows["echo test"].verdict == "no-go"
-    assert "disarm it" in rows["echo test"].advice
-    assert rows["state"].verdict == "warn"
-
-
-def test_arming_in_the_middle_of_the_echo_test_ends_it_with_a_release() -> None:
-    bench = Bench(params={"MAV_GCS_SYSID": 42})  # so the test lasts
-    sent = bench.log_sent()
-    began_ns = bench.clock.now_ns()
-    bench.clock.schedule(began_ns + 9 * NS_PER_S, bench.arm)
-    rows = bench.check(echo_test=True)
-    assert rows["echo test"].found == "refused"
-    overrides = [data for _, data in sent if data[7] == OVERRIDE]
-    sticks = [overrides.index(data) for data in overrides if data[10:18] != bytes(8)]
-    assert sticks, "it had begun"
-    assert max(sticks) < len(overrides) - 1, "the last word is a release"
-    late = [at_ns for at_ns, data in sent if data[7] == OVERRIDE and data[10:18] != bytes(8)]
-    assert max(late) < began_ns + 9.2 * NS_PER_S
 
 
 def test_a_vehicle_that_is_absent_is_one_clear_no_go() -> None:

@@ -9,8 +9,7 @@ import pytest
 from helpers.fakes import ListSink
 from helpers.pilots import single_rate, steady
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick
 from mavbridge.flight.policies import load_configured_policy

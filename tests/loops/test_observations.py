@@ -9,7 +9,7 @@ import pytest
 
 from helpers.fakes import ListSink
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings

@@ -18,7 +18,7 @@ import torch
 from helpers.flight_folders import write_spot_flight
 from helpers.policy_servers import when_it_listens
 from mavbridge.__main__ import main
-from mavbridge.commands.export.run import stretches
+from mavbridge.commands.export import stretches
 from mavbridge.core.processes import free_port, running
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import load_policy_of

@@ -14,9 +14,8 @@ from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
-from mavbridge.core.ports import Camera
-from mavbridge.core.records import CameraImage
-from mavbridge.core.workers import HungError, Worker
+from mavbridge.core.records import Camera, CameraImage
+from mavbridge.core.stopping import HungError, Worker
 from mavbridge.flight.policies import NO_IMAGE_ADVICE
 
 MEASURE_S = 2.0

@@ -1,15 +1,14 @@
 """Rows about the parameters, and the conditions of the flight by which they are judged."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig
-from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.mavlink.profiles.profile import ParamNote, Profile, StreamGroup
+from mavbridge.mavlink.profiles.profile import ParamNote, Profile
 from mavbridge.mavlink.profiles.sticks import IDENTITY
 from mavbridge.mavlink.session.params.checks import Assessment
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -27,7 +26,6 @@ class Terms:
     """Conditions of one vehicle and its planned flight, by which its parameters are judged."""
 
     config: FlyConfig
-    settings: LinkSettings
     plan: FlightPlan | None
     """None: no policy."""
     vehicle: VehicleSession
@@ -63,11 +61,6 @@ class Terms:
         names = self.profile.modes.roles.names
         return next((mode for mode in wanted if mode in names), None)
 
-    @property
-    def streams(self) -> tuple[StreamGroup, ...]:
-        """Telemetry requested by the flight."""
-        return self.profile.streams(state_hz=self.settings.state_hz)
-
     @cached_property
     def assessment(self) -> Assessment:
         """Judgement of the parameters for this flight."""
@@ -93,7 +86,7 @@ def param_rows(terms: Terms) -> Iterator[CheckRow]:
             wanted.get(name, ""),
             warn=text,
             no_go=text if any(note.kind in _REFUSED for note in about) else "",
-            commands=cures(about),
+            commands=tuple(note.cure for note in about if note.cure),
         )
     yield from _curve_rows(terms)
     if terms.contract is not None and terms.contract.action in ("rates", "attitude"):
@@ -104,11 +97,6 @@ def param_rows(terms: Terms) -> Iterator[CheckRow]:
             f"{terms.contract.hover_thrust:.2f} in training",
             "the vehicle does not tell at which thrust it hovers" if hover is None else "",
         )
-
-
-def cures(notes: Iterable[ParamNote]) -> tuple[str, ...]:
-    """Return the flags that fix the problems in these notes."""
-    return tuple(note.cure for note in notes if note.cure)
 
 
 def _found(terms: Terms, name: str) -> str:

@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.realtime import settle_thread
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed

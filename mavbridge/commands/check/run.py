@@ -18,7 +18,7 @@ from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
 from mavbridge.commands.output import print_status, text_console, write_json
 from mavbridge.config.flight import CameraConfig, FlyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
 from mavbridge.core.files import as_json, empty_folders_removed, require_writable
@@ -55,7 +55,7 @@ def check(config: CheckConfig) -> int:
         rows = [CheckRow("link", "vehicle", "none", "none for this check")]
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
-        rows = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
+        rows = check_vehicle(flight, plan, clock)
     rows += [*cameras, *policy, *_computer_rows(flight.rates), *_file_rows(flight)]
     soaked: dict[str, object] | None = None
     if config.soak is not None:

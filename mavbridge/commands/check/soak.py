@@ -169,11 +169,7 @@ class Soak:
 
 
 def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
-    """Load the policy of ``config``, and fly the bundled vehicle for ``duration_s``.
-
-    Raises:
-        MavbridgeError: the policy or the vehicle failed, or the flight ended early.
-    """
+    """Load the policy of ``config``, and fly the bundled vehicle for ``duration_s``."""
     port = free_port()
     with ExitStack() as stack:
         loaded = stack.enter_context(load_configured_policy(config.policy, clock))
@@ -214,12 +210,7 @@ def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: st
 
 
 def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Soak:
-    """Fly ``config.duration`` with a loaded policy, and measure it.
-
-    Raises:
-        PeerError: the policy lost the sticks, or the flight ended early.
-        MavbridgeError: it could not be flown.
-    """
+    """Fly ``config.duration`` with a loaded policy, and measure it."""
     plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
     timing = FlightTiming(
         stick_hz=config.rates.stick_rate,

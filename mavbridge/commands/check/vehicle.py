@@ -1,25 +1,20 @@
-"""Rows about the link and the vehicle: find it, set it up, measure it, run the echo test."""
+"""Rows about the link and the vehicle: find it, set it up, measure it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import Literal, TypeAlias
 
-from mavbridge.commands.check.params import Terms, cures, param_rows
+from mavbridge.commands.check.params import Terms, param_rows
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import (
-    NEUTRAL,
     ActionMeaning,
     AdviceText,
-    Command,
-    LinkSnapshot,
     LinkStats,
-    Release,
     VehicleStatus,
     VehicleText,
 )
@@ -40,11 +35,8 @@ SET_UP_S = 15.0
 to three seconds."""
 SETTLE_S, MEASURE_S, LOST_S = 1.0, 3.0, HEARTBEAT_TIMEOUT_NS / NS_PER_S
 """Time from granted streams to counting, time of counting, longest wait for a heartbeat."""
-ECHO_S, RELEASE_S = 3.0, 4.0
-"""Longest wait for the echo; longest time over which the releases of an override are spread."""
 _POLL_NS = NS_PER_MS
 """Time between two polls of the link; the kernel stamps messages that arrive meanwhile."""
-_STICK_NS = 20 * NS_PER_MS
 _ENOUGH = 0.9
 """Least acceptable share of the requested rate."""
 _ECHO_HZ = 20.0
@@ -70,9 +62,6 @@ _DEAF = (
 _link_row = partial(CheckRow, "link")
 _row = partial(CheckRow, "vehicle")
 
-EchoResult: TypeAlias = Literal["taken", "not taken", "armed"]
-"""``armed``: the vehicle is or became armed, so that sticks were not sent, or no longer."""
-
 
 class VehicleProbe:
     """Runs a ``MavlinkLink`` without a guard. Call its methods in the order of their definition."""
@@ -80,11 +69,8 @@ class VehicleProbe:
     def __init__(self, link: MavlinkLink, clock: Clock) -> None:
         self._link = link
         self._clock = clock
-        self._snapshot: LinkSnapshot | None = None
         self.texts: list[str] = []
         """Texts of the vehicle and the link."""
-        self.echo_problem: Reason | None = None
-        """The link's reason why the sticks of the echo test were not taken."""
 
     def find(self) -> VehicleSession:
         """Wait for the vehicle; raise the link's PeerError if there is none in time."""
@@ -109,54 +95,16 @@ class VehicleProbe:
         self._until(LOST_S, lambda: (self.find().condition.heartbeat or (0,))[0] > begun_ns)
         return self.find().problem(self._clock.now_ns())
 
-    def snapshot(self) -> LinkSnapshot:
-        """Return everything that the link knows now."""
-        return self._snapshot or self._pass()
-
-    def echo(self) -> EchoResult:
-        """Send neutral sticks while the vehicle is disarmed, watch their echo, and release them."""
-        result: EchoResult = "not taken"
-        due_ns = 0
-
-        def is_over() -> bool:
-            nonlocal result, due_ns
-            snapshot = self.snapshot()
-            if snapshot.status is None or snapshot.status.armed:
-                result = "armed"
-            elif snapshot.echo_confirmed:
-                result = "taken"
-            elif (now_ns := self._clock.now_ns()) >= due_ns:
-                due_ns = now_ns + _STICK_NS
-                self.echo_problem = snapshot.problem or self.echo_problem
-                self._link.send(Command(action=NEUTRAL))
-            return result != "not taken"
-
-        self._link.is_engaged = True
-        try:
-            self._until(ECHO_S, is_over)
-        finally:
-            if result != "armed" or due_ns:
-                self._until(RELEASE_S, self._release)
-            self._link.is_engaged = False
-        return result
-
-    def _release(self) -> bool:
-        """Release the sticks; return True once the vehicle confirms it."""
-        self._link.send(Release(because(Code.FINISHED, what="echo test")))
-        return self.snapshot().is_released and not self._link.is_release_owed
-
     def _until(self, limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:
         deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
         while self._clock.now_ns() < deadline_ns and not is_over():
             self._pass()
 
-    def _pass(self) -> LinkSnapshot:
+    def _pass(self) -> None:
         self._link.receive()
-        self._snapshot = self._link.snapshot()
-        self.texts += [text for text in self._snapshot.texts if text not in self.texts]
+        self.texts += [text for text in self._link.snapshot().texts if text not in self.texts]
         self._link.service()
         self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
-        return self._snapshot
 
 
 def check_vehicle(
@@ -164,7 +112,6 @@ def check_vehicle(
     plan: FlightPlan | None,
     clock: Clock,
     *,
-    echo_test: bool,
     transport: Transport | None = None,
 ) -> list[CheckRow]:
     """Return all rows about the link, the vehicle and its parameters; a failure becomes a row.
@@ -173,8 +120,7 @@ def check_vehicle(
     """
     is_dual = plan is None or plan.is_dual
     settings = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0).link
-    # No parameter is set, and no stick is sent without the test.
-    settings = replace(settings, readonly=not echo_test, set_params=())
+    settings = replace(settings, readonly=True, set_params=())
     rows: list[CheckRow] = []
     try:
         with ExitStack() as stack:
@@ -191,26 +137,26 @@ def check_vehicle(
             probe.find()
             probe.set_up()
             stats, problem = probe.measure(), probe.problem()
-            vehicle, snapshot, texts = probe.find(), probe.snapshot(), list(probe.texts)
+            vehicle, status = probe.find(), link.snapshot().status
             terms = Terms(
                 config=config,
-                settings=settings,
                 plan=plan,
                 vehicle=vehicle,
                 is_deaf=not (vehicle.version or vehicle.params.values or stats.rtt_ms),
             )
-            rows += _link_rows(stats, terms, problem)
-            if echo_test and not terms.is_deaf:
-                rows.append(_echo_row(probe, terms))
-            rows += _vehicle_rows(vehicle, snapshot.status, terms)
-            rows += _text_rows(texts)
+            streams = vehicle.profile.streams(state_hz=settings.state_hz)
+            rows += _link_rows(stats, streams, terms, problem)
+            rows += _vehicle_rows(vehicle, status, terms)
+            rows += _text_rows(probe.texts)
             rows += [] if terms.is_deaf else param_rows(terms)
     except MavbridgeError as error:
         rows.append(_link_row("vehicle", "none that can be flown", _FLOWN, no_go=str(error)))
     return rows
 
 
-def _link_rows(stats: LinkStats, terms: Terms, problem: Reason | None) -> Iterator[CheckRow]:
+def _link_rows(
+    stats: LinkStats, streams: Sequence[StreamGroup], terms: Terms, problem: Reason | None
+) -> Iterator[CheckRow]:
     vehicle = terms.vehicle
     place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
     no_go = "" if problem is None else f"the link is not ready: {problem}"
@@ -218,7 +164,7 @@ def _link_rows(stats: LinkStats, terms: Terms, problem: Reason | None) -> Iterat
     found = f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}"
     yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
     rates_hz = dict(stats.messages_per_s)
-    for group in terms.streams:
+    for group in streams:
         if group.is_needed and not terms.is_deaf:
             yield _rate_row(group, rates_hz, terms.plan)
     lost, uncounted = stats.lost_fraction, "no message came to count losses by"
@@ -278,39 +224,6 @@ def _rate_row(
             "rates, or a lower rates.action"
         )
     return row()
-
-
-def _echo_row(probe: VehicleProbe, terms: Terms) -> CheckRow:
-    """Send neutral sticks unless the vehicle is armed; return a row with the vehicle's response."""
-    name, expected = "echo test", f"our sticks from system {terms.assessment.context.source_system}"
-    if not terms.is_sticks:
-        text = "not sent: the vehicle shows setpoints only in their mode"
-        return _link_row(name, text, "actions that are sticks")
-    match probe.echo():
-        case "armed":
-            text = "the vehicle is armed: disarm it for the test"
-            return _link_row(name, "refused", expected, no_go=text)
-        case "taken":
-            return _link_row(name, "taken, and released", expected)
-    problem, found = probe.echo_problem, f"not seen in {ECHO_S:g} s"
-    code, assessment = None if problem is None else problem.code, terms.assessment
-    is_by_params = code in (Code.OBSTACLE, Code.CALIBRATION_UNUSABLE)
-    if is_by_params and not assessment.obstacles and assessment.unusable is None:
-        text = (
-            "the vehicle takes our sticks only after --set, and the check sets nothing: a flight "
-            "does, and then waits for the echo"
-        )
-        return _link_row(name, found, expected, warn=text)
-    return _link_row(
-        name,
-        found,
-        expected,
-        no_go=str(problem)
-        if problem is not None
-        else "the vehicle does not show our sticks: another station may be overriding them, or "
-        "it obeys another system id",
-        commands=cures(assessment.obstacles) if code is Code.OBSTACLE else (),
-    )
 
 
 def _vehicle_rows(

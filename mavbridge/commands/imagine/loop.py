@@ -46,7 +46,6 @@ class Sampler:
     """One world model in both roles, simulation and decision. Used by the loop's thread."""
 
     def __init__(self, model: WorldModel, *, ddim_steps: int) -> None:
-        """Wrap a model that is already on its device."""
         self.model = model
         self.config: WorldModelConfig = model.config
         self._ddim_steps = ddim_steps
@@ -75,9 +74,6 @@ class Sampler:
 
         Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
         of the noise.
-
-        Raises:
-            RolloutError: the result is not finite.
         """
         with torch.inference_mode():
             imagined = self.model.sample(
@@ -121,7 +117,6 @@ class ObservationQueue:
     """
 
     def __init__(self, start: RolloutStart, sampler: Sampler, decider: "Decider") -> None:
-        """Begin with the observed past."""
         contract = decider.contract
         self._latents = deque(sampler.encode(start.images), maxlen=len(start.images))
         self._states = deque(start.states, maxlen=len(start.states))
@@ -182,12 +177,7 @@ class PolicyDecider:
     images = 1
 
     def __init__(self, runner: PolicyRunner, sampler: Sampler, clock: Clock) -> None:
-        """Check that policy and world model fit together; ``clock`` is the policy's.
-
-        Raises:
-            UserError: states or sticks differ in meaning, or the policy takes inputs that are not
-                imagined.
-        """
+        """Raise UserError if policy and world model do not fit; ``clock`` is the policy's."""
         seen = runner.contract
         if len(seen.cameras) > 1 or seen.observation_steps > 1 or seen.state_extras:
             raise UserError(
@@ -288,9 +278,6 @@ def rollout(
 
     Only frames that the decider uses are decoded here: those of the executed steps that will still
     be in its queue, and none after the last iteration.
-
-    Raises:
-        RolloutError: the world model imagines NaN or infinity.
     """
     seen = ObservationQueue(start, sampler, decider)
     for iteration in range(plan.iterations):

@@ -27,7 +27,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray
-from mavbridge.core.workers import HungError
+from mavbridge.core.stopping import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video_file import WRITE_ERRORS
@@ -49,11 +49,7 @@ SCHEMA = pa.schema(
 
 
 def prepare_out(out: Path) -> None:
-    """Check that a rollout can be written here.
-
-    Raises:
-        UserError: the name is taken or not .mp4, or is not writable.
-    """
+    """Raise UserError if a rollout cannot be written here."""
     if out.suffix != ".mp4":
         raise UserError(f"--out {out} must end in .mp4")
     for path in (out, out.with_suffix(".arrows"), out.with_suffix(".parquet")):
@@ -123,11 +119,6 @@ class StreamedOutput:
     def sha256(self) -> str:
         """SHA-256 of all raw frames so far, in order."""
         return self._digest.hexdigest()
-
-    @property
-    def open_segments(self) -> int:
-        """Number of segments that are not written yet."""
-        return sum(not segment.done() for segment in self._open)
 
     def put(self, segment: Segment) -> None:
         """Hand over a segment; wait while ``QUEUED_SEGMENTS`` are waiting."""

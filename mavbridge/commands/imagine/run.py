@@ -91,18 +91,14 @@ def run_rollout(
     output: StreamedOutput,
     console: Console,
 ) -> bool:
-    """Run the iterations; return True if a signal ended them early.
-
-    Raises:
-        RolloutError: the rollout had to end; the message names the remaining files.
-    """
+    """Run the iterations; return True if a signal ended them early."""
     done = 0
     try:
         with stop_on_signals() as stop, progress_bar(console) as bar:
             task = bar.add_task("imagining", total=plan.iterations * plan.frames, status="")
 
             def refresh() -> None:
-                status = f"iteration {done}/{plan.iterations}, to decode {output.open_segments}"
+                status = f"iteration {done}/{plan.iterations}"
                 bar.update(task, completed=output.frames, status=status)
 
             for segment in rollout(sampler, decider, start, plan):
@@ -142,12 +138,7 @@ def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
-    """Read the context, from ``start_s`` after the first frame that has a state.
-
-    Raises:
-        UserError: the flight is too short, has no states or images there, or is of another kind.
-        VideoError: its video is damaged.
-    """
+    """Read the context, from ``start_s`` after the first frame that has a state, or raise."""
     _require_same_kind(flight, config)
     captured_ns = flight.frames["captured_ns"].to_numpy()
     ticks = flight.ticks.filter(flight.ticks["state"].is_valid())

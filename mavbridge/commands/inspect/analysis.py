@@ -28,13 +28,13 @@ from mavbridge.core.records import Position, Solve, Tick
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.observe.terminal import POOR, Verdict, number, rate_style, verdicts
+from mavbridge.observe.terminal import BAD, POOR, Verdict, number, rate_style, verdicts
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
-from mavbridge.recording import replay_tables
+from mavbridge.recording import replay_files
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
-from mavbridge.recording.folder import PACKETS, SOLVES, FlightError, FlightMeta
+from mavbridge.recording.folder import PACKETS, SOLVES, FlightMeta
+from mavbridge.recording.replay_files import read_settings
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.settings import read_settings
 from mavbridge.recording.tables import read_table, table_exists
 from policy.contract import Contract
 
@@ -185,7 +185,6 @@ class FlightAnalysis:
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
     flight, *others = open_cameras(folder)
-    _require_sound(flight)
     contract = flight.meta.contract
     cameras = dict(zip(contract.cameras, (flight, *others), strict=True))
     ticks = [row.tick for row in flight.tick_rows()]
@@ -214,18 +213,6 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         limits=limits,
         damage=tuple(dict.fromkeys(damage)),
     )
-
-
-def _require_sound(flight: RecordedFlight) -> None:
-    """Raise FlightError if the facts contain values that cannot be used for counting."""
-    meta = flight.meta
-    for name in ("action_hz", "visual_hz"):
-        if getattr(meta, name) <= 0:
-            raise FlightError(f"{flight.folder}: {name} of meta.json is no rate above zero")
-    for name in ("course_seed", "ticks_dropped", "frames_dropped", "packets_dropped"):
-        value = getattr(meta, name)
-        if value is not None and (not isinstance(value, int) or value < 0):
-            raise FlightError(f"{flight.folder}: {name} of meta.json is {value!r}, no whole number")
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
@@ -340,7 +327,7 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
     """
     if not table_exists(folder / PACKETS):
         return None
-    table = read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)
+    table = read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
     if not len(rows):
@@ -352,8 +339,26 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 def recorded_solves(flight: RecordedFlight) -> Iterator[Solve]:
     """Return the policy's solves in the order of time; nothing if they were not recorded."""
     if table_exists(stem := flight.folder / SOLVES):
-        table = read_table(stem, replay_tables.SOLVES)
-        yield from replay_tables.read_solves(table, flight.meta.contract)
+        table = read_table(stem, replay_files.SOLVES)
+        yield from replay_files.read_solves(table, flight.meta.contract)
+
+
+def flight_facts(flight: FlightAnalysis) -> Iterator[Verdict]:
+    """Yield losses, crash, course and path of a flight."""
+    meta = flight.meta
+    if meta.loss is not None:
+        yield Verdict("recording", meta.loss, POOR)
+    if meta.crash is not None:
+        yield Verdict("crashed", meta.crash, BAD)
+    for text in flight.damage:
+        yield Verdict("damage", text, BAD)
+    if meta.gates_passed is not None:
+        result = {True: "finished", False: "not finished", None: "no verdict"}[meta.success]
+        text = f"{meta.course_seed}: {meta.gates_passed} gates passed, {result}"
+        yield Verdict("course", text, BAD if meta.success is False else "")
+    if (track := flight.track) is not None:
+        highest_m = -track.position_ned_m[:, 2].min()
+        yield Verdict("path", f"{track.length_m:.0f} m, highest {highest_m:.1f} m")
 
 
 def flight_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:

@@ -12,7 +12,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.observe.timing import LATE_PERIODS
+from mavbridge.observe.timing import LATE_PERIODS, FlownChunk, FlownChunks
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.recorder import CrashWatch
 from mavbridge.recording.rows import FrameRow
@@ -69,15 +69,6 @@ def _delay(t_s: float, what: str, delay_ms: float, cause: Cause, count: int = 1)
     return Moment(t_s, what, delay_ms, f"{delay_ms:.1f} ms late: {cause}", cause, count)
 
 
-class _Solve(NamedTuple):
-    """Computation of the chunk that a tick flew."""
-
-    serial: int
-    started_ns: int
-    computed_ns: int
-    attitude_ns: int | None
-
-
 def is_gap(last: Tick, tick: Tick) -> bool:
     """True if the recording lacks ticks between these two neighbours."""
     return tick.serial != last.serial + 1
@@ -118,36 +109,24 @@ def _late_chunks(
     ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
 ) -> Iterator[Moment]:
     """Yield chunks that came more than ``LATE_PERIODS`` after the one before."""
-    before: Tick | None = None
-    last: _Solve | None = None
-    for tick in ticks:
+    chunks = FlownChunks()
+    for before, tick in zip([None, *ticks], ticks, strict=False):
         if before is not None and is_gap(before, tick):
-            last = None
-        before, solve = tick, _solve_of(tick)
-        if solve is None or last is None or solve.serial < last.serial:
-            last = solve
-        elif solve.serial > last.serial:
-            # Chunks in between, overtaken by newer ones before any send, were not late.
-            period_ns = (solve.computed_ns - last.computed_ns) / (solve.serial - last.serial)
-            if period_ns > LATE_PERIODS * chunk_ns:
-                delay_ms = (period_ns - chunk_ns) / NS_PER_MS
-                cause = _cause(last, solve, chunk_ns, arrivals)
-                yield _delay(_t_s(ticks, tick.woke_ns), "late chunk", delay_ms, cause)
-            last = solve
+            chunks = FlownChunks()
+        solve, last = chunks.add(tick)
+        if solve is None or last is None:
+            continue
+        # Chunks in between, overtaken by newer ones before any send, were not late.
+        period_ns = (solve.computed_ns - last.computed_ns) / (solve.serial - last.serial)
+        if period_ns > LATE_PERIODS * chunk_ns:
+            delay_ms = (period_ns - chunk_ns) / NS_PER_MS
+            cause = _cause(last, solve, chunk_ns, arrivals)
+            yield _delay(_t_s(ticks, tick.woke_ns), "late chunk", delay_ms, cause)
 
 
-def _solve_of(tick: Tick) -> _Solve | None:
-    if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
-        return None
-    return _Solve(
-        serial=tick.chunk_serial,
-        started_ns=tick.chunk_computed_ns - (tick.predict_ns or 0),
-        computed_ns=tick.chunk_computed_ns,
-        attitude_ns=None if tick.state is None else tick.state.attitude_ns,
-    )
-
-
-def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | None) -> Cause:
+def _cause(
+    last: FlownChunk, solve: FlownChunk, chunk_ns: float, arrivals: Arrivals | None
+) -> Cause:
     """Return the stage that caused most of the delay.
 
     A solve can start one period after the last one, once that has ended and an attitude is new.
@@ -170,7 +149,7 @@ def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | No
 
 
 def _arrival_ns(
-    arrivals: Arrivals | None, last: _Solve, solve: _Solve, chunk_ns: float
+    arrivals: Arrivals | None, last: FlownChunk, solve: FlownChunk, chunk_ns: float
 ) -> int | None:
     """Return the arrival of the first attitude that could have started a solve; None: not recorded.
 

@@ -13,7 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from mavbridge.commands.inspect.analysis import FlightAnalysis, FloatColumn, flight_verdicts
+from mavbridge.commands.inspect.analysis import (
+    FlightAnalysis,
+    FloatColumn,
+    flight_facts,
+    flight_verdicts,
+)
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.files import write_output
 from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind
@@ -87,15 +92,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "policy", f"{report.policy} on {report.engine}, {report.mode} rate", False
     yield "vehicle", report.autopilot or "none", False
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
-    if meta.crash is not None:
-        yield "crashed", meta.crash, True
-    if meta.loss is not None:
-        yield "recording", meta.loss, True
-    for text in flight.damage:
-        yield "damage", text, True
-    if meta.gates_passed is not None:
-        yield "course", f"{meta.gates_passed} gates passed", meta.success is False
-    for verdict in flight_verdicts(flight):
+    for verdict in (*flight_facts(flight), *flight_verdicts(flight)):
         yield verdict.name, verdict.text, verdict.style in (POOR, BAD)
     for name, measured in flight.times_ms.items():
         if measured is not None:

@@ -15,6 +15,7 @@ from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import (
     FlightAnalysis,
     analyse,
+    flight_facts,
     flight_verdicts,
     recorded_solves,
 )
@@ -40,7 +41,6 @@ _SOURCES = {
     "flight": "a policy's flight",
     "demonstration": "a demonstration by the expert",
     "dagger": "a flight by the policy, with the expert's labels",
-    "imagined": "an imagined flight",
     "pilot": "a pilot's flight",
 }
 
@@ -59,40 +59,18 @@ class Figure(NamedTuple):
 
 def print_flight(flight: FlightAnalysis, console: Console) -> None:
     """Print everything about one flight."""
-    for line in _facts(flight):
-        console.print(line)
-    print_damage(flight, console)
+    title = f": {_SOURCES[flight.meta.source]}, {flight.meta.started_at}"
+    console.print(Text.assemble((str(flight.folder), "bold"), title))
+    if flight.meta.outcome is not None:
+        console.print(Text(describe(flight.meta.outcome)))
+    for fact in flight_facts(flight):
+        console.print(fact.line)
     if (table := timing_table(flight.report)) is not None:
         console.print(table)
     for verdict in flight_verdicts(flight):
         console.print(verdict.line)
     console.print(_holders_table(flight))
     console.print(_moments_table(flight))
-
-
-def print_damage(flight: FlightAnalysis, console: Console) -> None:
-    """Print the skipped parts of the recording."""
-    for text in flight.damage:
-        console.print(Verdict("damage", text, BAD).line)
-
-
-def _facts(flight: FlightAnalysis) -> Iterator[Text]:
-    meta = flight.meta
-    yield Text.assemble(
-        (str(flight.folder), "bold"), f": {_SOURCES[meta.source]}, {meta.started_at}"
-    )
-    if meta.loss is not None:
-        yield Text(meta.loss, style="yellow")
-    if meta.crash is not None:
-        yield Text(f"crashed: {meta.crash}", style="red")
-    if meta.outcome is not None:
-        yield Text(describe(meta.outcome))
-    if meta.gates_passed is not None:
-        result = {True: "finished", False: "not finished", None: "no verdict"}[meta.success]
-        yield Text(f"course {meta.course_seed}: {meta.gates_passed} gates passed, {result}")
-    if flight.track is not None and len(flight.track.t_s):
-        heights_m = -flight.track.position_ned_m[:, 2]
-        yield Text(f"highest {heights_m.max():.1f} m, path of {flight.track.length_m:.0f} m")
 
 
 def _holders_table(flight: FlightAnalysis) -> Table:
@@ -150,7 +128,8 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
         )
     console.print(table)
     for flight in flights:
-        print_damage(flight, console)
+        for text in flight.damage:
+            console.print(Verdict("damage", text, BAD).line)
 
 
 def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:

@@ -165,14 +165,8 @@ class Episodes:
     ) -> None:
         """Record below ``out``, where earlier episodes are kept.
 
-        Args:
-            out: from ``prepare_out``.
-            clock: time of the start of each episode.
-            make_meta: returns the facts known at the start, given its stamp.
-            log_to: sends the vehicle's packets to a log from then on; None stops that.
-            autopilot: its name and version.
-            wall_offset_ns: wall time minus the clock, for the logs.
-            report: shows a line to the user; called by any thread.
+        ``make_meta`` gets the stamp of an episode's start; ``log_to`` sends the vehicle's packets
+        to a log from then on, or nowhere; ``report`` is called by any thread.
         """
         self._out = out
         self._clock = clock

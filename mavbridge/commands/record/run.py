@@ -27,15 +27,14 @@ from mavbridge.commands.record.episodes import (
 )
 from mavbridge.commands.record.view import CONTRACT, STICKS_FRESH_NS, PilotView, RecordScreen, Shown
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread
-from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.stopping import StopRequest, stop_on_signals
-from mavbridge.core.workers import Worker
+from mavbridge.core.records import Camera, TickSink
+from mavbridge.core.stopping import StopRequest, Worker, stop_on_signals
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.plan import plan_flight

@@ -8,9 +8,8 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import Event, Tick
+from mavbridge.core.records import Event, Tick, TickSink
 from mavbridge.core.vehicle import ForwardedPacket, Packet, Sticks
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.telemetry_cache import TelemetryCache

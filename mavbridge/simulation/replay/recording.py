@@ -11,7 +11,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.tlog import read_tlog
-from mavbridge.recording import replay_tables, rows
+from mavbridge.recording import replay_files, rows
 from mavbridge.recording.folder import (
     PACKETS,
     SOLVES,
@@ -21,15 +21,15 @@ from mavbridge.recording.folder import (
     features_of,
     read_meta,
 )
-from mavbridge.recording.replay_tables import (
+from mavbridge.recording.replay_files import (
     PacketStamp,
     packet_key,
     read_features,
     read_packets,
+    read_settings,
     read_solves,
 )
 from mavbridge.recording.rows import TickRow
-from mavbridge.recording.settings import read_settings
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 
@@ -88,7 +88,7 @@ def open_source(folder: Path) -> ReplaySource:
     flown = settings.config
     damage: list[str] = []
     ticks, solves, solves_lost = _rows(folder, meta, damage)
-    stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
+    stamps = list(read_packets(read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)))
     log, skipped = read_tlog(folder / TLOG)
     if skipped:
         damage.append(
@@ -132,7 +132,7 @@ def _rows(
     """Read ticks, solves and the number of lost solves; raise UserError without ticks or solves."""
     table = read_table(folder / TICKS, rows.TICKS, damage=damage)
     ticks = list(rows.read_ticks(table, meta.contract.action))
-    table = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
+    table = read_table(folder / SOLVES, replay_files.SOLVES, damage=damage)
     solves = list(read_solves(table, meta.contract))
     if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
         solves = [solve for solve in solves if solve.started_ns <= ticks[-1].tick.sent_ns]
@@ -155,7 +155,7 @@ def _features(
     if meta.mode != "dual":
         return ()
     tables = [
-        read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
+        read_table(folder / features_of(name), replay_files.FEATURES, damage=damage)
         for name in (None, *meta.contract.cameras[1:])
     ]
     return tuple(tuple(read_features(table)) for table in tables)

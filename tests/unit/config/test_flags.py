@@ -9,16 +9,15 @@ from typing import Any
 import pytest
 
 from mavbridge.commands import config as commands
-from mavbridge.config import episodes, flags, flight, policy, rates
+from mavbridge.config import episodes, flags, flight, policy
 from mavbridge.config.flags import Ranged
 from mavbridge.config.flight import CameraConfig
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.errors import UserError
 
 CONFIGS = dict.fromkeys(  # each once, in one order for all test processes
     each
-    for module in (commands, episodes, flight, policy, rates)
+    for module in (commands, episodes, flight, policy)
     for _, each in inspect.getmembers(module, is_dataclass)
     if isinstance(each, type) and issubclass(each, Ranged)
 )

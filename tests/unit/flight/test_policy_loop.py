@@ -9,7 +9,7 @@ import pytest
 
 from helpers.factories import make_guard_tick, make_plan
 from helpers.fakes import START_NS, FakeClock, ListSink, level_telemetry, samples_of
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.errors import PolicyError
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.speed import require_speed

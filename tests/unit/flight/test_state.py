@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_plan
 from helpers.fakes import level_telemetry
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because

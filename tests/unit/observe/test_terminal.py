@@ -13,7 +13,7 @@ from helpers.factories import (
     make_vision_tick,
 )
 from helpers.reports import report_of
-from mavbridge.config.rates import STATUS_HZ
+from mavbridge.config.policy import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick

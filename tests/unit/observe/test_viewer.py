@@ -117,13 +117,12 @@ def test_ages_are_spread_over_windows_in_milliseconds_beside_their_limits(show: 
 
 def test_what_was_not_measured_is_a_gap_and_all_plots_begin_and_end_together(show: Show) -> None:
     """As after a fault; nor is a chunk shown that nobody flies."""
-    blind = {"feature_captured_ns": None, "state": None, "rc_channels_us": (), "rc_sticks": None}
+    blind = {"feature_captured_ns": None, "state": None, "rc_sticks": None}
     seen = show([make_released_tick(0, **blind), make_solve()], [make_released_tick(500, **blind)])
     for path in ("age/image", "age/attitude", "compute/chunk", "period/chunk", "jitter/sticks"):
         assert seen.rows(path) == [], path
     for axis in Sticks._fields:
         assert all(math.isnan(seen.values(f"sticks/{axis}", series)[0]) for series in range(3))
-    assert all(math.isnan(seen.values("rc", channel)[0]) for channel in range(4))
     assert "/sticks/throttle/plan/0" not in seen.columns
     plots = (*layout.PLOTS, *layout.action_plots("sticks"))
     ends_ms = {(times[0], times[-1]) for plot in plots if (times := seen.times_ms(f"/{plot.path}"))}
@@ -260,24 +259,14 @@ def test_the_pose_is_shown_in_ned_whatever_the_contracts_frame(
     assert seen.values("motion/height") == pytest.approx([height_m], nan_ok=True)
 
 
-def test_the_path_and_four_channels_go_on_from_batch_to_batch_among_the_gates(show: Show) -> None:
+def test_the_path_goes_on_from_batch_to_batch_among_the_gates(show: Show) -> None:
     gate = CourseGate(Position(10.0, 2.0, -3.0), math.pi / 2, 2.0)  # flown through towards east
-    moved = (1100, 1200, 1300, 1400, 1500, 1600)
-    ticks = [
-        make_tick(
-            3 * k,
-            position_ned_m=Position(float(k), 0.0, 0.0),
-            rc_channels_us=moved if k else (1500,) * 8,
-        )
-        for k in range(5)
-    ]
+    ticks = [make_tick(3 * k, position_ned_m=Position(float(k), 0.0, 0.0)) for k in range(5)]
     seen = show(ticks[:3], ticks[3:], gates=(gate,))
     assert seen.strips("/scene/path") == [
         [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
         [[2, 0, 0], [3, 0, 0], [4, 0, 0]],
     ]
-    assert seen.rows("rc") == [[1500] * 4, *[[1100, 1200, 1300, 1400]] * 3]
-    assert seen.times_ms("/rc")[1:-1] == [0, 30, 60, 120]  # as they change, and at each end
     corners = [list(point) for point in seen.static["/scene/gates"]["LineStrips3D:strips"][0][0]]
     assert np.allclose(sorted(corners[:4]), [[9, 2, -4], [9, 2, -2], [11, 2, -4], [11, 2, -2]])
     assert seen.static["/scene/gates"]["LineStrips3D:labels"] == [["1"]]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavbridge.config.flight import Limits
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import Rates
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import observation_ages_ns
 from policy.contract import Contract, history_ages_ns

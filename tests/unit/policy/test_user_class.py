@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from helpers.loaded_policies import act, load
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 from policy.errors import PolicyError, user_code
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest

@@ -142,7 +142,7 @@ def _pointer(name: str) -> Spoil:
         (_meta(source="dream"), "source 'dream'"),
         (_meta(outcome={"end": "duration"}), "incomplete or damaged"),
         (_meta(outcome="good"), "incomplete or damaged"),
-        (_meta(start_ns="now"), "start_ns is 'now', not a number"),
+        (_meta(start_ns="now"), "start_ns is 'now', not a whole number"),
     ],
 )
 def test_a_spoiled_flight_says_what_is_wrong(flight: Path, spoil: Spoil, told: str) -> None:

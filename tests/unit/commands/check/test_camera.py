@@ -13,7 +13,7 @@ from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.records import Frame
-from mavbridge.core.workers import Worker
+from mavbridge.core.stopping import Worker
 
 FRAME_NS = 33_333_333
 SCENE = np.random.default_rng(0).integers(0, 255, (224, 224, 3)).astype(np.uint8)

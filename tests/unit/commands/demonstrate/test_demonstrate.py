@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mavbridge.commands.demonstrate.pilot import TurnSchedule, draw_variation, from_now
-from mavbridge.commands.demonstrate.run import DemonstrationSpec, demonstrate, fly_demonstration
+from mavbridge.commands.demonstrate import DemonstrationSpec, demonstrate, fly_demonstration
+from mavbridge.commands.demonstrate_pilot import TurnSchedule, draw_variation, from_now
 from mavbridge.commands.train import fit_to_flights
 from mavbridge.config.episodes import COURSE_SEEDS, AutopilotKind, DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig

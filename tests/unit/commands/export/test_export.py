@@ -25,7 +25,7 @@ from helpers.flight_folders import (
 from helpers.lerobot_rules import broken_rules
 from helpers.status import status_of, told_by
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.run import export, stretches, whole_or_nothing, write_dataset
+from mavbridge.commands.export import export, stretches, whole_or_nothing, write_dataset
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data import lerobot_format as names
@@ -139,7 +139,7 @@ def test_a_round_trip_keeps_rows_and_images(flights: list[Path], dataset: Path) 
 def test_files_are_grouped_in_chunks(
     flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mavbridge.commands.export.dataset.FILES_A_CHUNK", 2)
+    monkeypatch.setattr("mavbridge.commands.export_dataset.FILES_A_CHUNK", 2)
     write(flights, tmp_path / "out")
     assert broken_rules(tmp_path / "out") == []
     assert [len(list(each.decode())) for each in read_dataset(tmp_path / "out")] == [20, 25, 30]
@@ -267,16 +267,16 @@ def interrupted(*_: object, number: int = signal.SIGINT, **__: object) -> None:
 @pytest.mark.parametrize(
     ("name", "act", "status"),
     [
-        ("dataset.pq.write_table", full, 2),
-        ("run.read_flights", interrupted, 130),
-        ("run.read_flights", partial(interrupted, number=signal.SIGTERM), 130),
+        ("export_dataset.pq.write_table", full, 2),
+        ("export.read_flights", interrupted, 130),
+        ("export.read_flights", partial(interrupted, number=signal.SIGTERM), 130),
     ],
 )
 def test_nothing_is_left_of_an_export_that_breaks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, act: object, status: int
 ) -> None:
     flight = fly(tmp_path / "a")
-    monkeypatch.setattr(f"mavbridge.commands.export.{name}", act)
+    monkeypatch.setattr(f"mavbridge.commands.{name}", act)
     assert status_of("export", flight, "--out", tmp_path / "out") == status
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.flight_folders import LEVEL, MS
-from mavbridge.commands.export.run import (
+from mavbridge.commands.export import (
     MAX_HELD_NS,
     Stretch,
     common_fps,

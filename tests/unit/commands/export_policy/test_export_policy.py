@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.commands import export_policy as run
+from mavbridge.commands import convert
 from mavbridge.commands.config import ExportPolicyConfig
-from mavbridge.commands.export_policy import export_policy
+from mavbridge.commands.convert import export_policy
 from mavbridge.core.errors import UserError
 from policy.contract import Contract, FloatArray
 
@@ -40,7 +40,7 @@ def test_files_that_are_another_policy_are_not_praised(
         compared.append(np.full((8, 16, 4), 0.1 + 0.02 * len(compared), np.float32))
         return compared[-1]
 
-    monkeypatch.setattr(run, "chunks_of_samples", chunks_of_samples)
+    monkeypatch.setattr(convert, "chunks_of_samples", chunks_of_samples)
     config = ExportPolicyConfig(out=tmp_path / "toge")
     with pytest.raises(UserError, match=r"another policy: a stick is off by 0\.02"):
         export_policy(None, config)

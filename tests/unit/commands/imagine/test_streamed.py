@@ -17,7 +17,7 @@ from helpers.recordings import count_frames, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
-from mavbridge.core.workers import HungError
+from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video_file import read_video
 
@@ -68,7 +68,7 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
             for iteration in range(1, 20):
                 made.put(make_segment(iteration))
                 put.append(iteration)
-                if made.open_segments > QUEUED_SEGMENTS:
+                if sum(not each.done() for each in made._open) > QUEUED_SEGMENTS:
                     is_full.set()
 
         producer = threading.Thread(target=produce)

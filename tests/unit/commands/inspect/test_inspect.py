@@ -259,7 +259,7 @@ def test_facts_that_nothing_can_be_counted_with_are_refused_by_name(
     folder = write(tmp_path / "flight", [make_tick(0)])
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | damage))
-    with pytest.raises(MavbridgeError, match=f"{next(iter(damage))} of meta.json"):
+    with pytest.raises(MavbridgeError, match=f"meta.json: {next(iter(damage))} is"):
         analyse(folder)
 
 

@@ -9,16 +9,22 @@ import pytest
 from helpers.factories import START_NS, make_solve, make_state
 from helpers.recordings import make_frame, make_meta, without_writer_process
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.rates import Rates
+from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording import flight_writer, replay_tables
+from mavbridge.recording import flight_writer, replay_files
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import SETTINGS, FlightError
-from mavbridge.recording.replay_tables import packet_key, read_features, read_packets, read_solves
-from mavbridge.recording.settings import ReplaySettings, read_settings, write_settings
+from mavbridge.recording.replay_files import (
+    ReplaySettings,
+    packet_key,
+    read_features,
+    read_packets,
+    read_settings,
+    read_solves,
+    write_settings,
+)
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 
@@ -72,7 +78,7 @@ def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
     if is_finished:
         writer.finish(writer.meta)
 
-    table = read_table(tmp_path / "solves", replay_tables.SOLVES)
+    table = read_table(tmp_path / "solves", replay_files.SOLVES)
 
     assert table["dropped_before"].to_pylist() == [0, 0, 2]
     assert [*map(comparable, read_solves(table, CONTRACT))] == [*map(comparable, solves)]
@@ -86,8 +92,8 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     writer.frame(replace(vision, camera=1, serial=2, fault=FROZEN, feature=-value))
     writer.finish(writer.meta)
 
-    (front,) = read_features(read_table(tmp_path / "features", replay_tables.FEATURES))
-    down = read_table(tmp_path / "features_down", replay_tables.FEATURES)
+    (front,) = read_features(read_table(tmp_path / "features", replay_files.FEATURES))
+    down = read_table(tmp_path / "features_down", replay_files.FEATURES)
 
     assert front.value.tobytes() == value.tobytes()
     assert front.value.shape == (1, 3)
@@ -109,7 +115,7 @@ def test_a_single_rate_flight_keeps_packets_and_no_images_as_features(
     writer.frame(make_frame(0, feature=np.zeros((1, 3, 8, 8), np.float32)))
     writer.finish(writer.meta)
 
-    table = read_table(tmp_path / "packets", replay_tables.PACKETS)
+    table = read_table(tmp_path / "packets", replay_files.PACKETS)
 
     assert list(read_packets(table)) == [(7, 5, 0, 7), (9, 9, 0, 7), (13, 13, 0, 7)]
     assert table["dropped_before"].to_pylist() == [0, 0, 2]

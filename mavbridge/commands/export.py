@@ -18,7 +18,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
+from mavbridge.commands.export_dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
@@ -112,11 +112,7 @@ def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[i
 
 
 def common_fps(parts: Sequence[Stretch]) -> int:
-    """Return the integer frame rate that LeRobot assumes for all frames.
-
-    Raises:
-        UserError: flights of several rates, or of one that is far from any integer.
-    """
+    """Return the integer frame rate that LeRobot assumes for all frames, or raise UserError."""
     common = _rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))
     fps = max(1, round(common))
     if abs(common / fps - 1.0) > MAX_RATE_OFF:
@@ -217,11 +213,7 @@ def write_dataset(
 
 
 def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
-    """Write the contract file of a policy trained on a dataset of these flights.
-
-    Raises:
-        DatasetError: a flight's meta.json cannot be read.
-    """
+    """Write the contract file of a policy trained on a dataset of these flights."""
     kind = "flight folder"
     metas = [read_object(flight / "meta.json", DatasetError, kind) for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
@@ -251,9 +243,6 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
 
     An empty folder that is there may be a mounted one, which is not replaced: it gets the contents.
     SIGTERM ends the block as Ctrl-C does, and no folder stays.
-
-    Raises:
-        UserError: ``out`` is not empty, or cannot be written.
     """
     place = Path(os.path.realpath(out))
     try:

@@ -116,7 +116,6 @@ class EpisodeVideo:
     """
 
     def __init__(self, path: Path, spec: DatasetSpec) -> None:
-        """Create the file."""
         self._container = av.open(library_name(path), "w", options={"movflags": "faststart"})
         self._stream = self._container.add_stream("libx264", spec.fps)
         self._stream.height, self._stream.width = spec.height, spec.width
@@ -254,12 +253,7 @@ class DatasetWriter:
         }
 
     def finish(self) -> None:
-        """Write the files that describe the whole dataset.
-
-        Raises:
-            VideoError: no episode had images.
-            OSError, FFmpegError: it cannot be written.
-        """
+        """Write the files that describe the whole dataset."""
         if self.rows == 0:
             raise VideoError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)

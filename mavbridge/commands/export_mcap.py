@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeAlias
 from mcap.writer import Writer
 
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.run import whole_or_nothing
+from mavbridge.commands.export import whole_or_nothing
 from mavbridge.commands.output import print_warnings, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import Tick

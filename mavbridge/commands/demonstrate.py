@@ -8,11 +8,11 @@ from pathlib import Path
 from shutil import rmtree
 
 import mavbridge
-from mavbridge.commands.demonstrate.pilot import Pilot, Variation, draw_variation
+from mavbridge.commands.demonstrate_pilot import Pilot, Variation, draw_variation
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
 from mavbridge.config.episodes import DemonstrateConfig
-from mavbridge.config.rates import SIM_CAMERA_PX, Rates
+from mavbridge.config.policy import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.provenance import digests
@@ -49,12 +49,7 @@ class DemonstrationSpec:
 
 
 def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) -> bool:
-    """Fly and record one course; return True if it was finished.
-
-    Raises:
-        EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished flight.
-        MavbridgeError: it cannot be flown or recorded.
-    """
+    """Fly and record one course; return True if it was finished. See ``FlyJob``."""
     rmtree(spec.folder, ignore_errors=True)
     prepare_folder(spec.folder, "--out")
     config = spec.config
@@ -207,12 +202,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 
 def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
-    """Return the episodes without a finished recording.
-
-    Raises:
-        UserError: the folder of an episode holds another flight, or something else.
-        FlightError: the folder of an episode holds a meta.json that is damaged or not ours.
-    """
+    """Return the episodes without a finished recording; raise if a folder holds anything else."""
     weights = digests(policy_files(config.policy)) if config.has_student else {}
     specs = []
     for index in range(config.episodes):

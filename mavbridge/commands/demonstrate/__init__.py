@@ -1,1 +1,0 @@
-"""``mavbridge demonstrate``: flights of simulated gate courses, flown or labelled by an expert."""
