@@ -58,8 +58,7 @@ from policy.errors import NoChunkError
 from policy.protocol import PolicyRunner, keep_nothing
 
 VIDEO_TOLERANCE = 0.15
-"""Tolerance of a smoothed stick for the lossy video, in full deflections: twice the measured
-difference, see docs/commands.md."""
+"""Tolerance of a smoothed stick for the lossy video, in full deflections: twice that measured."""
 ENGINE_TOLERANCE = 0.05
 """Tolerance of a smoothed stick on another engine, in full deflections. A single chunk can differ
 by ``parity.MAX_ACTION_ERROR``."""
@@ -270,7 +269,7 @@ class ReplayResult:
 
     source: ReplaySource
     gaps: tuple[str, ...]
-    """What the recording lacks, in words: the replay may differ there."""
+    """Where the recording lacks something, so that the replay may differ."""
     chosen: ReplayFrom
     engine: str | None
     """Engine of the policy; None: the policy was not used."""
