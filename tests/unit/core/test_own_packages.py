@@ -1,10 +1,11 @@
 import shutil
-import subprocess
 import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 
+from helpers.programs import ended
 from mavbridge import OUR_SAFE_PATH, SAFE_PATH
 from mavbridge.__main__ import PACKAGES
 from mavbridge.core.processes import child_environment, user_environment
@@ -14,18 +15,10 @@ from policy.errors import PolicyError
 ROOT = Path(__file__).parents[3]
 
 
-def start(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def start(folder: Path, *arguments: str) -> CompletedProcess[str]:
     """As a user does who keeps a file of this name in the folder where mavbridge is started."""
     environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-    return subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    return ended(sys.executable, *arguments, cwd=folder, env=environment)
 
 
 @pytest.mark.parametrize(("name", "is_folder"), [*zip(PACKAGES, (False, True), strict=True)])
@@ -33,10 +26,10 @@ def test_a_file_that_hides_one_of_ours_is_named(tmp_path: Path, name: str, is_fo
     hiding = tmp_path / name / "__init__.py" if is_folder else tmp_path / f"{name}.py"
     hiding.parent.mkdir(exist_ok=True)
     hiding.write_text("raise SystemExit('imported')\n")
-    ended = start(tmp_path, "-m", "mavbridge", "--version")
-    assert ended.returncode == 2
-    assert ended.stderr.startswith(f"error: {hiding} hides mavbridge's own package {name}: ")
-    assert f"--policy ./{name}.py:Class" in ended.stderr
+    done = start(tmp_path, "-m", "mavbridge", "--version")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {hiding} hides mavbridge's own package {name}: ")
+    assert f"--policy ./{name}.py:Class" in done.stderr
     assert start(tmp_path, "-P", "-m", "mavbridge", "--version").returncode == 0
 
 
@@ -72,8 +65,8 @@ def test_modules_of_the_working_directory_are_not_run(trap: Path) -> None:
 @pytest.mark.system  # loads the network, and starts workers and writers of videos
 def test_modules_beside_weights_are_not_run(trap: Path) -> None:
     flights = ("--episodes", "2", "--workers", "2", "--max-time", "1", "--out", "out")
-    ended = start(trap, "-m", "mavbridge", "demonstrate", *flights, "--checkpoint", WEIGHTS.name)
-    assert ended.returncode == 0, ended.stderr
+    done = start(trap, "-m", "mavbridge", "demonstrate", *flights, "--checkpoint", WEIGHTS.name)
+    assert done.returncode == 0, done.stderr
     require_unsprung(trap)
 
 

@@ -1,9 +1,9 @@
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from helpers.programs import ended
 from mavbridge.core import processes
 from mavbridge.core.processes import child_environment, end, free_port, log_tail, running
 
@@ -56,9 +56,7 @@ def test_no_port_is_given_twice_by_two_processes(monkeypatch: pytest.MonkeyPatch
         f"from mavbridge.core import processes\nprocesses.PORTS_TO_GIVE = {ports}\n"
         "while True: print(processes.free_port(), flush=True)"
     )
-    child = subprocess.run(
-        [sys.executable, "-c", asks], env=child_environment(), capture_output=True, text=True
-    )
+    child = ended(sys.executable, "-c", asks, env=child_environment())
     theirs = {int(line) for line in child.stdout.split()}
     assert len(ours) == 3
     assert theirs

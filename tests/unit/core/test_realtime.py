@@ -1,13 +1,13 @@
 import gc
 import os
 import platform
-import subprocess
 import sys
 from collections.abc import Iterator
 from unittest.mock import Mock
 
 import pytest
 
+from helpers.programs import ended
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import (
     ACTION_FIFO_PRIORITY,
@@ -54,8 +54,7 @@ if os.getuid() == 0:
 def printed_by(program: str) -> list[str]:
     """Lines of a process of its own, since these settings cannot be taken back."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    done = ended(sys.executable, "-c", program, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from helpers.fakes import FakeClock
+from helpers.programs import ended
 from mavbridge.core.stopping import (
     INTERRUPTED,
     ONE_REQUEST_NS,
@@ -154,7 +155,5 @@ end_process(5, lambda: print("last words", file=sys.stderr))
 
 def test_the_process_ends_with_its_last_words() -> None:
     """Also if nobody reads: terminal-stalled in tests/faults/catalogue/host.toml."""
-    ended = subprocess.run(
-        [sys.executable, "-c", END], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (ended.returncode, ended.stderr) == (5, "last words\n")
+    process = ended(sys.executable, "-c", END)
+    assert (process.returncode, process.stderr) == (5, "last words\n")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.programs import ended
 from helpers.status import asked_flight
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.recording.folder import EXTRA
@@ -50,16 +51,9 @@ def test_messages_name_the_packages_of_the_extras() -> None:
 def test_the_simulator_says_what_it_lacks() -> None:
     code = "import sys; sys.modules['mujoco'] = None; from sitl.__main__ import main; "
     code += "sys.exit(main([]))"
-    ended = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert ended.returncode == 2
-    assert ended.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
+    refused = ended(sys.executable, "-c", code, cwd=ROOT)
+    assert refused.returncode == 2
+    assert refused.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd is installed here")
@@ -68,13 +62,7 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     text, count = re.subn("ExecStart=.*", "ExecStart=/bin/true", (DEPLOY / unit.name).read_text())
     assert count == 1
     unit.write_text(text)
-    verified = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", str(unit)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
+    verified = ended("systemd-analyze", "verify", "--man=no", str(unit))
     assert (verified.returncode, verified.stderr) == (0, "")
 
 
@@ -82,9 +70,7 @@ def test_systemd_understands_the_unit(tmp_path: Path) -> None:
 def test_bash_completes_commands_and_flags(tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path), "SHELL": "/bin/bash", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", "-m", "mavbridge", "--install-completion"]
-    installed = subprocess.run(
-        command, env=os.environ | home, capture_output=True, text=True, timeout=60, check=False
-    )
+    installed = ended(*command, env=os.environ | home)
     assert installed.returncode == 0, installed.stderr
     (script,) = (
         path for path in tmp_path.rglob("*") if path.is_file() and path.stem == "mavbridge"
@@ -93,7 +79,7 @@ def test_bash_completes_commands_and_flags(tmp_path: Path) -> None:
         COMP_WORDS=(mavbridge inspect --ht); COMP_CWORD=2
         _mavbridge mavbridge --ht inspect; echo "${{COMPREPLY[@]}}"
         """
-    reply = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True)
+    reply = ended("bash", "-c", asked)
     assert reply.stdout.split() == ["--html"]
 
 
@@ -106,14 +92,8 @@ def build_wheel(folder: Path) -> Path:
         (tree / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tree / name)
     command = "from setuptools.build_meta import build_wheel; print(build_wheel('..'))"
-    made = subprocess.run(
-        [sys.executable, "-c", command],
-        cwd=tree,
-        env=os.environ | {"SOURCE_DATE_EPOCH": "1800000000"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = os.environ | {"SOURCE_DATE_EPOCH": "1800000000"}
+    made = ended(sys.executable, "-c", command, cwd=tree, env=environment)
     assert made.returncode == 0, made.stderr
     return folder / made.stdout.split()[-1]
 

@@ -2,7 +2,6 @@ import io
 import json
 import os
 import shutil
-import subprocess
 import sys
 from base64 import b64decode
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from helpers.factories import make_released_tick, make_state, make_tick
+from helpers.programs import ended
 from helpers.recordings import make_frame, make_meta, write_recording
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
@@ -100,15 +100,11 @@ def test_one_flight_is_told_with_its_figures_causes_and_moments(
 def test_a_terminal_without_utf8_gets_escapes_and_the_page_is_whole(tmp_path: Path) -> None:
     write(tmp_path / "flight", flown(9), meta=make_meta(policy="飛"))
     c_locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    ended = subprocess.run(
-        [sys.executable, "-m", "mavbridge", "inspect", "flight", "--html", "page.html"],
-        cwd=tmp_path,
-        env=os.environ | c_locale | {"PYTHONPATH": str(GOLDEN.parents[2])},
-        capture_output=True,
-        text=True,
-    )
-    assert ended.returncode == 0, ended.stderr
-    assert "\\u98db on torch" in ended.stdout
+    environment = os.environ | c_locale | {"PYTHONPATH": str(GOLDEN.parents[2])}
+    words = ("-m", "mavbridge", "inspect", "flight", "--html", "page.html")
+    process = ended(sys.executable, *words, cwd=tmp_path, env=environment)
+    assert process.returncode == 0, process.stderr
+    assert "\\u98db on torch" in process.stdout
     assert "■" in (tmp_path / "page.html").read_text(encoding="utf-8")  # of its script
 
 

@@ -1,7 +1,6 @@
 """The OpenVINO engine against plain torch, on a CPU; every graph is compiled once per test run."""
 
 import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.programs import ended
 from policy.checkpoints.networks import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_compile
@@ -147,9 +147,7 @@ print(heard, sys.modules["openvino_telemetry"])
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the alternate signal stack is kept on Linux")
 def test_a_signal_is_heard_whatever_has_become_of_the_engine_which_does_not_call_home() -> None:
-    ran = subprocess.run(
-        [sys.executable, "-c", SIGNALS], capture_output=True, text=True, timeout=120, check=False
-    )
+    ran = ended(sys.executable, "-c", SIGNALS)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.strip() == "['in flight', 'after it'] None"
 
