@@ -10,12 +10,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, VehicleState
 from mavbridge.flight.feature_cache import MAX_PAST, FeatureCache
-from mavbridge.flight.state import (
-    MAX_STATES,
-    Observation,
-    ObservationSource,
-    observation_ages_ns,
-)
+from mavbridge.flight.state import MAX_STATES, Observation, ObservationSource
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -119,16 +114,6 @@ def test_each_past_state_is_told_of_its_own_image() -> None:
     np.testing.assert_allclose(rows[:, 17], [-30, -25, -20], atol=1e-3)
 
 
-def test_one_observation_of_one_camera_passes_through_untouched() -> None:
-    cache, state = FeatureCache(), felt(0)
-    looks = source(Contract(feature_dim=1), cache)
-    assert looks.observe(state, NOW_NS) == because(Code.NO_IMAGE)
-    cache.publish(feature := seen(20))
-    found = observed(looks.observe(state, NOW_NS))
-    assert found.encoded is feature.value
-    np.testing.assert_array_equal(found.states, state.values[None])
-
-
 @pytest.mark.parametrize(
     ("front", "down", "reason"),
     [
@@ -227,8 +212,3 @@ def test_the_newest_row_is_the_state_itself_with_its_optional_inputs() -> None:
     looks.push(replace(state, values=felt(5).values))
     rows = observed(looks.observe(state, NOW_NS)).states[0, -1]
     assert rows.tolist() == [*state.values.tolist(), 7.0]
-
-
-def test_ages_of_observations() -> None:
-    assert observation_ages_ns(THREE_STEPS) == (200 * MS, 100 * MS, 0)
-    assert observation_ages_ns(Contract()) == (0,)

@@ -181,16 +181,6 @@ def test_without_guards_a_flight_is_told_by_its_end() -> None:
     assert FlightReferee(GATES).outcome("signal", HOVERING) is None, "nobody has flown"
 
 
-def test_a_fault_names_its_reason_and_is_no_example() -> None:
-    fault = make_released_tick(61, "no chunk for 100 ms", phase="leaving")
-    outcome = judged([*course_ticks(61), fault], "fault")
-    assert (outcome.end, outcome.success, outcome.gates_passed) == ("fault", False, 1)
-    assert describe(outcome) == (
-        "1 of 2 gates in 0.4 s, no contact seen; ended by a fault after 0.6 s, at 2.0 m, 10.0 m/s, "
-        "now armed in LOITER: no chunk for 100 ms"
-    )
-
-
 def test_a_second_flight_has_a_reason_of_its_own() -> None:
     taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
     first = [*course_ticks(50), make_released_tick(51, taken, phase="released")]

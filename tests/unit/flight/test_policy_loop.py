@@ -13,7 +13,7 @@ from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import Reading, Sample, Sticks, Telemetry, Velocity
+from mavbridge.core.vehicle import Reading, Sample, Sticks, Telemetry
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
@@ -123,17 +123,6 @@ def test_a_chunk_carries_the_moments_that_it_came_from(velocity_ms: int, force_m
         actions=(),
     )
     assert chunk.actions == ((0.0,) * 4,) * 3
-
-
-def test_actions_reach_the_guard_in_its_own_kind_and_axes() -> None:
-    chunk = np.array([[[1, 2, 3, 0.5]]], np.float32)
-    rig = Rig(lambda: chunk, action="velocity", state_frame="enu_flu").measure().see()
-    rig.loop.step()
-    (chunk,) = rig.sent
-    assert isinstance(chunk, Chunk)
-    (action,) = chunk.actions
-    assert isinstance(action, Velocity)
-    assert action == Velocity(2.0, 1.0, -3.0, -0.5)
 
 
 @pytest.mark.parametrize("north_mps", [0.0, 2.0])

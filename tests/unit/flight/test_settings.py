@@ -224,13 +224,6 @@ def test_a_flag_that_would_loosen_is_refused(name: str, asked_s: float, allowed_
     assert allowed != effective_freshness(AGED, Limits())
 
 
-def test_a_measured_flight_may_have_tighter_ages_too() -> None:
-    limits = Limits(max_attitude_age=0.02, max_velocity_age=1, max_feature_age=0.5, max_chunk_age=9)
-    contract = contract_with_ages(AGED, limits)
-    assert effective_freshness(contract, Limits()) == in_ms(20, 1000, 500, 9000, 500)
-    assert contract_with_ages(AGED, Limits()) == AGED
-
-
 def test_the_state_folder_follows_the_users_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,12 +61,6 @@ def test_one_that_clearly_cannot_keep_its_limits_is_refused_with_the_figures(
         notes_of(encode_ms, act_ms, hz=hz, contract=playing(play_s))
 
 
-def test_chunks_must_come_before_the_horizon_of_the_last_one_ends() -> None:
-    short = replace(playing(0.8), horizon=16)
-    with pytest.raises(PolicyError, match=r"1\.3 s old, beyond the 800 ms of its horizon"):
-        notes_of(0, 500, hz=1.25, contract=short)
-
-
 @pytest.mark.parametrize("act_ms", [0.01, None])
 @pytest.mark.parametrize(
     ("horizon", "dt_s", "hz", "least"),

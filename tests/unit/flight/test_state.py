@@ -246,17 +246,6 @@ def since(states: list[VehicleState], after_ms: float) -> list[float]:
 EAST = (R, 0.0, 0.0, R)
 
 
-@pytest.mark.parametrize(("frame", "turn"), [("ned_frd", pi / 2), ("enu_flu", -pi / 2)])
-def test_a_quarter_turn_to_the_right_with_a_push_north(frame: StateFrame, turn: float) -> None:
-    states = [moved(0, v=(1, 0, 0), frame=frame), moved(100, EAST, (4, 0, 0), frame)]
-    # North is ahead at the exposure, and only then.
-    assert since(states, 0) == pytest.approx([0.1, 0, 0, turn, 3, 0, 0], abs=1e-6)
-    # Half way there it was turned by half of it, and ahead was north-east.
-    side = -1.5 * R if frame == "ned_frd" else 1.5 * R
-    half = [0.05, 0, 0, turn / 2, 1.5 * R, side, 0]
-    assert since(states, 50) == pytest.approx(half, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("states", "after_ms", "expected"),
     [
@@ -281,7 +270,6 @@ def test_motion_is_even_between_two_states_and_none_outside(
 
 
 def exponential(turn: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula."""
     angle = max(float(np.linalg.norm(turn)), 1e-12)
     return rotation((np.cos(angle / 2), *np.sin(angle / 2) / angle * turn))
 

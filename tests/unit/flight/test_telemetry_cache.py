@@ -15,12 +15,7 @@ from mavbridge.core.vehicle import Reading, Sticks, Telemetry
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import (
-    GuardError,
-    GuardStatus,
-    Samples,
-    encode_samples,
-)
+from mavbridge.guard.wire import GuardError, GuardStatus, Samples, encode_samples
 from policy.contract import Contract
 
 MS = NS_PER_MS

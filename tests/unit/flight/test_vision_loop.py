@@ -19,8 +19,6 @@ FRAME_NS = NS_PER_S // 30
 
 
 class StillCamera:
-    """Delivers the same picture over and over."""
-
     dropped_frames = 0
 
     def __init__(self, clock, picture):
