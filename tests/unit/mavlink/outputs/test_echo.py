@@ -294,20 +294,6 @@ def test_the_dither_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us:
 # --- release
 
 
-def test_a_release_is_confirmed_by_other_sticks_than_ours() -> None:
-    world = World(delay_ms=50.0)
-    assert world.echo.is_released
-    world.engage()
-    assert not world.echo.is_released
-    world.release()
-    world.run(0.1)  # still on its way there and back
-    assert not world.echo.is_released
-    assert world.run(0.2) is None
-    assert world.echo.is_released
-    world.engage()
-    assert not world.echo.is_released
-
-
 def test_a_receiver_that_rests_close_to_our_last_sticks_confirms_the_release() -> None:
     world = World(sticks=lambda _now_ns: (1500, 1500, 1500, 1500))
     world.receiver = (1500, 1501, 1500, 1500)

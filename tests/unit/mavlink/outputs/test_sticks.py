@@ -114,14 +114,6 @@ def test_level_sticks_go_ahead_of_a_release_that_would_keep_ours(
 # --- MANUAL_CONTROL
 
 
-def test_px4_shows_our_sticks_rounded_down() -> None:
-    flight = px4_flight()
-    for k in range(200):
-        echo(flight, Sticks(0.3, 0.2, -0.1, k / 1000), lost=k % 2)
-        assert flight.problem is None
-    assert flight.output.echo_confirmed
-
-
 @pytest.mark.parametrize(
     ("shown", "code", "expected"),
     [

@@ -69,15 +69,6 @@ def test_every_role_is_a_mode_that_can_be_asked_for(profile: Profile) -> None:
         assert profile.modes.name(custom_mode) == name
 
 
-def test_modes_of_a_copter() -> None:
-    modes = ARDUPILOT.modes
-    assert modes.name(2) == "ALT_HOLD"
-    assert modes.command("alt_hold") == (dialect.MAV_CMD_DO_SET_MODE, (1, 2, 0))
-    assert modes.name(99) == "99"
-    with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
-        modes.command("HOVER")
-
-
 def test_modes_of_px4_without_a_name_of_their_own() -> None:
     modes = PX4.modes
     assert modes.name(3 << 16 | 2 << 24) == "POSCTL"  # slow: flown with sticks all the same

@@ -33,36 +33,6 @@ def test_the_vehicle_of_the_training_gets_the_same_sticks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("channel", "pwm_us", "measure", "seen", "error"),
-    [
-        (1, 1700, lambda motion: motion.roll_deg, 11.26, 0.05),
-        (2, 1300, lambda motion: motion.pitch_deg, 11.27, 0.05),
-        (4, 1700, lambda motion: motion.yaw_degps, 77.8, 2.5),
-        (3, 1700, lambda motion: motion.climb_mps, 0.64, 0.02),
-    ],
-)
-def test_a_policy_of_other_gains_gets_what_was_measured(
-    channel: int, pwm_us: int, measure: Callable[..., float], seen: float, error: float
-) -> None:
-    """On the firmware with its defaults these PWM values gave these leans and rates."""
-    gains = StickGains(
-        lean_deg=50.0,
-        yaw_rate_degps=300.0,
-        climb_mps=4.0,
-        lean_dead_zone=0.0,
-        yaw_dead_zone=0.1,
-        throttle_dead_zone=0.05,
-    )
-    values = copter_values()
-    curves = ardupilot_curves(values, "ALT_HOLD", gains)
-    rc = calibration(values)
-    pwm = dict(zip((3, 4, 2, 1), rc.to_pwm_us(NEUTRAL), strict=True)) | {channel: pwm_us}
-    sticks = curves.to_policy(rc.to_sticks((pwm[3], pwm[4], pwm[2], pwm[1])))
-    assert measure(policy_motion(sticks, gains)) == pytest.approx(seen, abs=error)
-    assert rc.to_pwm_us(curves.to_vehicle(sticks)) == (pwm[3], pwm[4], pwm[2], pwm[1])
-
-
-@pytest.mark.parametrize(
     "conditions", [HALF, TWICE, replace(TWICE, pilot_yaw_expo=0.4)], ids=["half", "twice", "expo"]
 )
 def test_other_gains_give_the_motion_of_the_training(conditions: Conditions) -> None:
