@@ -25,7 +25,6 @@ HZ = 30
 
 
 def chunks(frame_id: int, data: bytes, *, part: int = 1400, stamp_ns: int = 0) -> list[bytes]:
-    """Return the datagrams of one picture."""
     parts = [data[at : at + part] for at in range(0, len(data), part)]
     return [
         HEADER.pack(frame_id % (1 << 32), place, len(parts), len(data), len(each), stamp_ns) + each

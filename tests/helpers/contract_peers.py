@@ -187,7 +187,6 @@ class Companion:
         return self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, int(1e6 / rate_hz))
 
     def interval_us(self, message_id: int) -> int:
-        """Return the interval at which the vehicle says it sends a message."""
         self.send_command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, message_id)
         interval = self.wait("MESSAGE_INTERVAL")
         assert interval.message_id == message_id
@@ -203,7 +202,6 @@ class Companion:
 
     @property
     def in_the_air(self) -> bool:
-        """True if the vehicle does not report that it is on the ground."""
         message_id = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
         state = self.request(message_id, "EXTENDED_SYS_STATE").landed_state
         return bool(state != mav.MAV_LANDED_STATE_ON_GROUND)
@@ -235,7 +233,6 @@ class Companion:
         return self.write_param(name, old.param_type, value)
 
     def write_param(self, name: str, kind: int, value: float) -> float:
-        """Send PARAM_SET with a value in its wire encoding."""
         self.send(mav.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
         return float(self.wait("PARAM_VALUE", where=lambda m: m.param_id == name).param_value)
 
@@ -260,12 +257,10 @@ def velocity_target(
 
 
 def named(messages: list[Any], name: str) -> list[Any]:
-    """Return the messages of that name, in order."""
     return [message for message in messages if message.get_type() == name]
 
 
 def last(messages: list[Any], name: str) -> Any:
-    """Return the newest message of that name."""
     return named(messages, name)[-1]
 
 
@@ -288,5 +283,4 @@ def rate_hz(messages: list[Any], heard_s: float) -> float:
 
 
 def is_armed(heartbeat: Any) -> bool:
-    """True if the vehicle is armed."""
     return bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -20,8 +20,6 @@ STILL_MPS = 0.25
 
 
 class CopterCompanion(Companion):
-    """`Companion` for ArduCopter."""
-
     def set_mode(self, number: int) -> int:
         return self.command(mav.MAV_CMD_DO_SET_MODE, 1, number)
 
@@ -86,11 +84,9 @@ class CopterCompanion(Companion):
         assert self.set_mode(mode) == ACCEPTED
 
     def texts(self) -> list[str]:
-        """Return the status texts since ``seen`` was cleared."""
         return texts_in(self.seen)
 
     def arming_refusal(self) -> str:
-        """Ask for arming; return the text that says why not."""
         self.send_command(ARM, 1)
         return str(self.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:")).text)
 

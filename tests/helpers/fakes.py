@@ -45,8 +45,6 @@ class FakeClock:
 
 
 class ListSink:
-    """Sink that keeps every event."""
-
     def __init__(self) -> None:
         self.events: list[Event] = []
 
@@ -110,7 +108,6 @@ class FakeLink:
         self._samples += samples_of(self._telemetry)
 
     def change(self, **status: Any) -> None:
-        """Replace fields of the vehicle's status."""
         assert self.status is not None
         self.status = replace(self.status, **status)
 

@@ -162,7 +162,6 @@ class CountingActor(nn.Module):
 
     @torch.jit.export
     def reset(self) -> None:
-        """Forget the calls."""
         self.hidden_state[:] = 0.0
 
 

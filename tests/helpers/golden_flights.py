@@ -13,13 +13,11 @@ NAMES = ("toge_ardupilot", "numpy_px4", "scripted_velocity_ardupilot")
 
 @cache
 def golden(name: str) -> ReplaySource:
-    """Open one of ``NAMES``."""
     return open_source(FLIGHTS / name)
 
 
 @cache
 def through_gate(name: str) -> tuple[GuardStep, ...]:
-    """Return the guard's steps with the flight's recorded chunks."""
     return tuple(replay_guard(golden(name)))
 
 

@@ -177,11 +177,9 @@ class GuardFlight:
         )
 
     def tell(self, message: ToGuard) -> None:
-        """Send the guard a message now."""
         self._port.send(encode_to_guard(message))
 
     def act(self, act: OperatorCommand) -> None:
-        """Perform an explicit act at the terminal."""
         self.tell(act)
 
     def stop(self) -> None:
@@ -209,7 +207,6 @@ class GuardFlight:
         self.vehicle.take_outgoing(1)
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
         self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * NS_PER_S))
 
     def until(self, condition: Callable[[], object], *, within_s: float) -> float:
@@ -231,7 +228,6 @@ class GuardFlight:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The vehicle's report."""
         return self.vehicle.log.summary(self.vehicle.ap)
 
     @property
@@ -283,7 +279,6 @@ class GuardFlight:
 
     @property
     def ap(self) -> ArduCopter:
-        """The vehicle's autopilot since its last boot."""
         return self.vehicle.ap
 
     @property
@@ -292,7 +287,6 @@ class GuardFlight:
 
     @property
     def ticks(self) -> list[GuardTick]:
-        """Every report of the guard."""
         return [r for r in self.guard_port.reports if isinstance(r, GuardTick)]
 
     @property
@@ -315,7 +309,6 @@ class GuardFlight:
 
     @property
     def messages(self) -> list[str]:
-        """Lines for the user."""
         return [r for r in self.guard_port.reports if isinstance(r, str)]
 
     def phases(self, since_ns: int = 0) -> list[Phase]:
@@ -333,7 +326,6 @@ class GuardFlight:
         return [(at_ns, m) for at_ns, m in found if at_ns >= since_ns]
 
     def modes_asked(self, since_ns: int = 0) -> list[int]:
-        """Numbers of the requested modes."""
         return [
             int(m.param2)
             for _, m in self.left(since_ns)
@@ -360,13 +352,11 @@ class GuardFlight:
 
     @property
     def modes(self) -> list[str]:
-        """The vehicle's modes in order."""
         return [entry["mode"] for entry in self.summary["modes"]]
 
     # --- others
 
     def pilot_mode(self, number: int) -> None:
-        """Change the mode as a pilot at a ground station."""
         self.command(dialect.MAV_CMD_DO_SET_MODE, 1, number)
 
     def command(self, number: int, *params: float) -> None:

@@ -53,8 +53,6 @@ JOYSTICK = Sticks(0.3, -0.4, -0.6, -0.5)
 
 
 class Wire:
-    """Transport that keeps the sent data."""
-
     def __init__(self) -> None:
         self.sent: list[bytes] = []
 

@@ -129,7 +129,6 @@ class OutputFlight(GuardFlight):
         return chunk
 
     def return_nan(self) -> None:
-        """Return NaN from the policy from now on."""
         self._nan_from_ns = self.clock.now_ns()
 
     # --- into the air
@@ -173,7 +172,6 @@ class OutputFlight(GuardFlight):
 
     @property
     def now_s(self) -> float:
-        """Time of the policy."""
         return self.clock.now_ns() / NS_PER_S
 
     @property
@@ -190,7 +188,6 @@ class OutputFlight(GuardFlight):
         return "AUTO.LOITER" if self.is_px4 else "LOITER"
 
     def lose_position(self) -> None:
-        """Make the estimator lose its horizontal position."""
         (self.px4 if self.is_px4 else self.ardupilot).position_lost = True
 
     # --- the record

@@ -104,7 +104,6 @@ class ParamVehicle:
         self.params.receive(ParamValue(name, value), status(self.armed, self.has_receiver))
 
     def fall_silent(self) -> None:
-        """Answer nothing from now on."""
         self.values.clear()
         self._answers.clear()
 

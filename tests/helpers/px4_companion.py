@@ -54,7 +54,6 @@ def attitude_target(roll_deg: float = 0.0, thrust: float = HOVER_THRUST, yaw: fl
 
 
 def rate_target(yaw_degps: float) -> Any:
-    """Return a setpoint of body rates."""
     rates = (0, 0, math.radians(yaw_degps), HOVER_THRUST)
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates)
 
@@ -125,7 +124,6 @@ class Px4Companion(Companion):
         raise AssertionError(f"not within {within_s} s")
 
     def mode(self) -> int:
-        """Return the active mode, by CURRENT_MODE."""
         name = f"UNKNOWN_{CURRENT_MODE}"
         return decode_current_mode(self.request(CURRENT_MODE, name)).custom_mode
 

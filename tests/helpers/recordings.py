@@ -35,7 +35,6 @@ def picture(number: int, *, height: int = 48, width: int = 64) -> ImageArray:
 
 
 def number_of(rgb: ImageArray) -> int:
-    """Return the number that was given to ``picture``."""
     half = _BLOCK // 2
     return sum(
         int(rgb[_BLOCK * (bit // 4) + half, _BLOCK * (bit % 4) + half, 1] > 127) << bit
@@ -44,7 +43,6 @@ def number_of(rgb: ImageArray) -> int:
 
 
 def count_frames(path: Path) -> int:
-    """Return the number of whole frames of a video."""
     return len(video_parts(path).fragments)
 
 
@@ -54,7 +52,6 @@ def make_frame(number: int, **changes: Any) -> VisionTick:
 
 
 def make_row(number: int, **changes: Any) -> FrameRow:
-    """Return the row of frame ``number``."""
     vision = make_vision_tick(number + 1)
     row = FrameRow(
         frame_id=number, captured_ns=vision.captured_ns, ready_ns=vision.ready_ns, dropped_before=0

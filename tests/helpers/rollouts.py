@@ -114,8 +114,6 @@ def make_sampler(model: WorldModel | None = None) -> Sampler:
 
 @dataclass(frozen=True)
 class Finished:
-    """Output of a rollout."""
-
     sha256: str
     model: TinyWorld
     output: StreamedOutput

@@ -6,13 +6,7 @@ from typing import NamedTuple
 from mavbridge.core.vehicle import StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import (
-    RcEngine,
-    climb_rate_mps,
-    lean_angles,
-    read_sticks,
-    yaw_rate_radps,
-)
+from sitl.ardupilot.rc import RcEngine, climb_rate_mps, lean_angles, read_sticks, yaw_rate_radps
 from sitl.vehicle.conditions import Conditions
 from sitl.vehicle.firmware import Receiver
 
@@ -36,7 +30,6 @@ class Motion(NamedTuple):
 
 
 def policy_motion(sticks: Sticks, gains: StickGains) -> Motion:
-    """Return the motion by the contract, one stick at a time."""
 
     def linear(stick: float, dead_zone: float) -> float:
         beyond = max(0.0, abs(stick) - dead_zone) / (1.0 - dead_zone)
@@ -55,7 +48,6 @@ def policy_motion(sticks: Sticks, gains: StickGains) -> Motion:
 
 
 def copter_values(**changed: float) -> dict[str, float]:
-    """Parameters of the simulated copter."""
     params = ArduPilotParams()
     return {name: params[name] for name in params.names} | changed
 

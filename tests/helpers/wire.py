@@ -37,8 +37,6 @@ CALIBRATION = {
 
 
 class WireEnd:
-    """A MAVLink endpoint for tests."""
-
     def __init__(self, system: int = 1, component: int = 1) -> None:
         self.mav = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self.mav.robust_parsing = True

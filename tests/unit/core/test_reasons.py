@@ -10,14 +10,7 @@ import pytest
 
 import mavbridge
 from mavbridge.core import reasons
-from mavbridge.core.reasons import (
-    Code,
-    Kind,
-    Reason,
-    because,
-    reason_from_json,
-    reason_to_json,
-)
+from mavbridge.core.reasons import Code, Kind, Reason, because, reason_from_json, reason_to_json
 
 FORMATTER = string.Formatter()
 DISARMED = because(Code.DISARMED)

@@ -9,12 +9,7 @@ from helpers.guard_facts import flight_settings, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import (
-    IDLE,
-    NEUTRAL,
-    Command,
-    Sticks,
-)
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Sticks
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop

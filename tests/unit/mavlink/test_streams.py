@@ -4,11 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import (
-    CommandAck,
-    Endpoint,
-    StreamRequest,
-)
+from mavbridge.mavlink.codec.messages import CommandAck, Endpoint, StreamRequest
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile, StreamGroup

@@ -8,12 +8,7 @@ from pathlib import Path
 import pytest
 
 from helpers.factories import make_tick
-from helpers.recordings import (
-    make_frame,
-    make_meta,
-    number_of,
-    write_recording,
-)
+from helpers.recordings import make_frame, make_meta, number_of, write_recording
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Tick, VisionTick

@@ -25,8 +25,6 @@ BODY = BodyState(
 
 
 class Renderer:
-    """Remembers the rates that it was asked to draw."""
-
     def __init__(self) -> None:
         self.rate_radps: Vec3 | None = None
 

@@ -40,7 +40,6 @@ class Pilot:
             watch(self.ap)
 
     def silence(self, seconds: float) -> None:
-        """Send nothing."""
         for _ in range(round(seconds * NS_PER_S / STEP_NS)):
             self.ap.step()
 

@@ -9,6 +9,7 @@ import pytest
 
 from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.fakes import FakeClock
+from helpers.reports import report_of
 from mavbridge.commands.check import soak
 from mavbridge.commands.check.soak import (
     CLIMB_STICK,
@@ -27,7 +28,6 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
-from mavbridge.observe.timing import FlightTiming, TimingReport
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -41,13 +41,6 @@ def make_runner(calls: list[int]) -> PolicyRunner:
 
     names = {"name": "mine", "engine": "numpy"}
     return PolicyRunner(**names, contract=RATES, dual_rate=True, encode=lambda rgb: rgb, act=act)
-
-
-def report_of(*ticks: Tick) -> TimingReport:
-    timing = FlightTiming(stick_hz=100.0, action_hz=100.0, vision_hz=30.0)
-    for tick in ticks:
-        timing.emit(tick)
-    return timing.report(mode="dual", engine="numpy", policy="mine")
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:

@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.recordings import count_frames
-from helpers.rollouts import (
-    SIZE,
-    Finished,
-    make_plan,
-    make_sampler,
-    read_rows,
-    run,
-    segments,
-)
+from helpers.rollouts import SIZE, Finished, make_plan, make_sampler, read_rows, run, segments
 from mavbridge.commands.imagine.loop import DECIDE, SIMULATE, RolloutPlan
 from mavbridge.recording.video_file import read_video
 

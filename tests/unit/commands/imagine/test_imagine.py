@@ -28,7 +28,6 @@ Imagine = Callable[..., tuple[int, str]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight and a world model."""
     folder = tmp_path_factory.mktemp("imagine")
     write_flight(folder / "flight")
     save_world_model(folder / "world.safetensors", TinyWorld())

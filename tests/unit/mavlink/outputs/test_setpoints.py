@@ -17,12 +17,7 @@ from mavbridge.core.vehicle import (
     BodyRates,
     Velocity,
 )
-from mavbridge.mavlink.codec.messages import (
-    Attitude,
-    AttitudeTarget,
-    SpecificForce,
-    VelocityTarget,
-)
+from mavbridge.mavlink.codec.messages import Attitude, AttitudeTarget, SpecificForce, VelocityTarget
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.outputs.attitude import MOST_LEAD_RAD, AttitudeOutput
 from mavbridge.mavlink.outputs.setpoints import HELD_NS, VelocityOutput

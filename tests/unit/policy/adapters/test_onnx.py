@@ -371,7 +371,6 @@ class Deep(nn.Module):
     """Fails inside of torch."""
 
     def forward(self, image: Tensor, state: Tensor) -> Tensor:
-        """Multiply matrices that do not fit."""
         return torch.matmul(state, torch.zeros(7, 4))
 
 

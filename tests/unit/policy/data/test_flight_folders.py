@@ -9,14 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from helpers.flight_folders import (
-    LEVEL,
-    MS,
-    spot,
-    ticks_table,
-    write_flight,
-    write_meta,
-)
+from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from policy.data.flight_data import DatasetError, hold_out
 from policy.data.flight_folders import (
     failure_of,

@@ -17,12 +17,7 @@ from helpers import torch_policies
 from helpers.torch_policies import Counter, TwoRates
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
-from policy.engines.choose import (
-    MAX_STICK_ERROR,
-    Candidate,
-    choose_runner,
-    first_that_agrees,
-)
+from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError

@@ -5,6 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from helpers.wire import WireEnd
 from sitl.camera.follow import PoseListener
 from sitl.clock import NS_PER_S
 from sitl.vehicle.rotation import IDENTITY, from_euler
@@ -14,21 +15,12 @@ RATE_HZ = 60.0
 QUATERNION, POSITION = 31, 32
 
 
-class Vehicle:
-    """Packs what a vehicle would send."""
-
-    def __init__(self, system=1, component=1):
-        self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-
-    def heartbeat(self, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA):
-        kind = mavlink.MAV_TYPE_QUADROTOR
-        return self._mav.heartbeat_encode(kind, autopilot, 0, 0, 4).pack(self._mav)
-
+class Vehicle(WireEnd):
     def quaternion(self, wxyz=IDENTITY, rate_radps=(0.0, 0.0, 0.0)):
-        return self._mav.attitude_quaternion_encode(0, *wxyz, *rate_radps).pack(self._mav)
+        return self.pack(self.mav.attitude_quaternion_encode(0, *wxyz, *rate_radps))
 
     def position(self, position_m=(1.0, 2.0, -3.0), velocity_mps=(0.0, 0.0, 0.0)):
-        return self._mav.local_position_ned_encode(0, *position_m, *velocity_mps).pack(self._mav)
+        return self.pack(self.mav.local_position_ned_encode(0, *position_m, *velocity_mps))
 
 
 @pytest.fixture
@@ -80,8 +72,8 @@ def test_values_that_cannot_be_are_ignored(listener, vehicle, bad):
 
 def test_only_the_first_autopilot_is_followed():
     listener, camera, other = PoseListener(rate_hz=RATE_HZ), Vehicle(1, 100), Vehicle(2)
-    listener.receive(Vehicle(255, 190).heartbeat(mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
-    listener.receive(Vehicle(7, 1).heartbeat(mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
+    listener.receive(Vehicle(255, 190).heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
+    listener.receive(Vehicle(7, 1).heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID), T0_NS)
     listener.receive(Vehicle(1).heartbeat() + other.heartbeat(), T0_NS)
     listener.receive(other.quaternion() + other.position(), T0_NS)
     listener.receive(camera.quaternion() + camera.position(), T0_NS)

@@ -2,19 +2,13 @@
 
 import pytest
 
+from helpers.fakes import FakeClock
 from sitl import UsageError
 from sitl.pilot import gamepad
 from sitl.pilot.gamepad import GamepadPilot
 from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, PERIOD_NS, pad_sticks, parse_axes
 
 MIDDLE = (1500, 1500, 1500, 1500)
-
-
-class Clock:
-    now = 0
-
-    def now_ns(self):
-        return self.now
 
 
 def test_axes_are_read_and_may_be_reversed():
@@ -45,7 +39,7 @@ class FakePad:
         self.is_there = True
         self.values = [0.0] * 6
         self.down = set()
-        self.clock = Clock()
+        self.clock = FakeClock()
         self.pilot = GamepadPilot(self, parse_axes(DEFAULT_AXES), self.clock)
 
     def poll(self):
@@ -60,7 +54,7 @@ class FakePad:
     def frame(self, *buttons):
         """Channels of the next frame."""
         self.down = set(buttons)
-        self.clock.now += PERIOD_NS
+        self.clock.advance_ns(PERIOD_NS)
         return self.pilot.latest()
 
 
