@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -134,8 +135,12 @@ def _rows(
     ticks = list(rows.read_ticks(table, meta.contract.action))
     table = read_table(folder / SOLVES, replay_files.SOLVES, damage=damage)
     solves = list(read_solves(table, meta.contract))
-    if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
-        solves = [solve for solve in solves if solve.started_ns <= ticks[-1].tick.sent_ns]
+    if ticks and solves and not meta.finished:  # cut off: the last of either lack their inputs
+        newest, count = solves[-1].serial, len(ticks)
+        ticks = list(takewhile(lambda row: (row.tick.chunk_serial or 0) <= newest, ticks))
+        if count > len(ticks):
+            damage.append(f"the chunks of its last {count - len(ticks)} ticks are not recorded")
+        solves = [each for each in solves if ticks and each.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solves:
         raise UserError(
             f"{folder} ended before its policy had computed anything: nothing to replay"

@@ -124,6 +124,26 @@ def test_of_a_flight_that_was_cut_off_the_solves_behind_its_last_tick_are_left_o
     assert replay(folder, ReplayConfig(source="chunks")) == ExitCode.DONE
 
 
+def test_of_a_flight_that_was_cut_off_the_ticks_of_lost_chunks_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """kill -9 of the flight process: its last solves never reached the writer."""
+    folder = copied("numpy_px4", tmp_path)
+    flown = [tick for tick in open_source(NUMPY).ticks if tick.chunk_serial is not None]
+    solves = pq.read_table(folder / "solves.parquet")
+    kept = [serial <= flown[-10].chunk_serial for serial in solves["serial"].to_pylist()]
+    pq.write_table(solves.filter(kept), folder / "solves.parquet")
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"finished": False}))
+
+    assert replay(folder, ReplayConfig(source="chunks")) == ExitCode.DONE
+
+    source = open_source(folder)
+    assert source.ticks[-1].chunk_serial == flown[-10].chunk_serial
+    assert re.search(r"the chunks of its last \d\d+ ticks are not recorded", *source.gaps)
+    assert "EQUAL, bit for bit" in capsys.readouterr().out
+
+
 def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
     folder, written = copied("numpy_px4", tmp_path), tmp_path / "replay.json"
     log = bytearray((folder / "link.tlog").read_bytes())
