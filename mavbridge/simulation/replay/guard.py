@@ -224,6 +224,8 @@ def _absences(source: ReplaySource, period_ns: int) -> Iterator[tuple[int, Reaso
                 said = said or because(Code.NO_CHUNK)  # they were too old
             if isinstance(said, Reason):
                 yield max(taken_ns + 1, at_ns - 1 - shortening_ns), said
+                if not tick.is_slot:  # the last of them caused this pass
+                    yield at_ns, said
 
 
 def _is_seen(solve: Solve, tick: Tick, after: Tick | None) -> bool:
