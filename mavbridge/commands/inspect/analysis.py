@@ -216,13 +216,16 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
-    """Return the stick rate by the median time between slots; without slots, the action rate."""
-    due_ns = np.array([tick.due_ns for tick in ticks if tick.is_slot and tick.due_ns > 0], np.int64)
-    periods_ns = np.diff(due_ns)
-    periods_ns = periods_ns[periods_ns > 0]
-    if not len(periods_ns):
+    """Return the stick rate by the slots and their numbers; without slots, the action rate.
+
+    A new chunk sent shortly before a slot stands for it, so that more than half may be absent.
+    """
+    slots = [(tick.index, tick.due_ns) for tick in ticks if tick.is_slot and tick.due_ns > 0]
+    steps, gaps_ns = np.diff(np.array(slots, np.int64).reshape(-1, 2), axis=0).T
+    is_later = (steps > 0) & (gaps_ns > 0)
+    if not is_later.any():
         return meta.action_hz
-    return round(NS_PER_S / float(np.median(periods_ns)), 1)
+    return round(NS_PER_S / float(np.median(gaps_ns[is_later] / steps[is_later])), 1)
 
 
 def _report(
