@@ -181,9 +181,9 @@ class GuardLoop:
             PeerError: the vehicle cannot be found.
             UserError: the vehicle cannot be flown.
         """
-        woke_ns = self._clock.now_ns()
-        # Samples leave at once: the policy solves while the guard looks at the rest.
-        self._forward(self._link.receive())
+        # Samples leave at once: the policy solves while the guard looks at the rest. Packets may
+        # arrive meanwhile: a replay receives those up to ``woke_ns``.
+        woke_ns = max(self._clock.now_ns(), self._forward(self._link.receive()))
         snapshot = self._link.snapshot()
         self._report_vehicle(snapshot)
         given = self._receive(snapshot)
@@ -282,12 +282,14 @@ class GuardLoop:
             )
             self._flight.send(encode_from_guard(late))
 
-    def _forward(self, arrivals: LinkArrivals) -> None:
+    def _forward(self, arrivals: LinkArrivals) -> int:
+        """Pass samples and packets on. Return the arrival of the last packet, or 0."""
         # The flight process does not read samples before a policy is loaded; keep the queue free.
         if arrivals.samples and self._guard is not None:
             self._samples.send(encode_samples(arrivals.samples))
         if arrivals.packets and self._guard is not None:
             self._flight.send(encode_from_guard(Packets(arrivals.packets)))
+        return arrivals.packets[-1].arrived_ns if arrivals.packets else 0
 
     def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
         """Send the vehicle's status if it has changed, and the link's texts."""

@@ -9,7 +9,7 @@ from helpers.guard_facts import flight_settings, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, ForwardedPacket, LinkArrivals, Sticks
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
@@ -155,6 +155,24 @@ def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
     rig.link.send = lambda one, at_ns: rounded if send(one, at_ns) else None  # type: ignore[method-assign]
     rig.run(0.05)
     assert rig.ticks[-1].sent == rounded
+
+
+def test_a_packet_that_comes_while_the_link_is_read_belongs_to_the_pass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A replay receives what had arrived by the time at which the guard woke."""
+    rig = Rig().flying()
+    late_ns = rig.clock.now_ns() + 20_000
+
+    def receive() -> LinkArrivals:
+        rig.clock.sleep_until_ns(late_ns + 1)
+        return LinkArrivals((), (ForwardedPacket(late_ns, late_ns, b"attitude"),))
+
+    monkeypatch.setattr(rig.link, "receive", receive)
+    rig.tell(rig.chunk())
+    rig.loop.step()
+
+    assert rig.ticks[-1].woke_ns == late_ns
 
 
 def test_motion_alone_is_passed_on_without_a_step_of_the_guard(
