@@ -115,7 +115,7 @@ BAD = [
     (f"{IMAGINE} --start nowhere", "no folder nowhere"),
     (f"{IMAGINE} --start empty", "empty is empty"),
     (f"{IMAGINE} --start foreign", "is not of a recorded flight"),
-    (f"{IMAGINE} --start enu", "states in enu_flu, the world model takes ned_frd"),
+    (f"{IMAGINE} --start enu", "trained with state_frame ned_frd, --start enu has enu_flu"),
     (f"{IMAGINE} --start enu --world-model enu.safetensors {TOGE}", "enu_flu"),
     (f"{IMAGINE} --start flight --world-model none.safetensors", "none.safetensors"),
     (f"{IMAGINE} --start flight --world-model taken.mp4", "taken.mp4"),

@@ -108,12 +108,14 @@ def test_states_and_sticks_of_another_meaning_are_refused(
 ) -> None:
     other = Contract(feature_dim=1, arrays="numpy", **{term: value})
     with pytest.raises(UserError, match=f"trained with {term} .*the policy .* has "):
-        PolicyDecider(noise_runner(other), make_sampler())
+        PolicyDecider(noise_runner(other), make_sampler(), SteppedClock())
     opened = open_flight(flight)
     with pytest.raises(UserError, match=f"trained with {term} .*--start .* has "):
         read_start(replace(opened, meta=replace(opened.meta, contract=other)), TINY, 0.0)
     one_mode = Contract(feature_dim=1, arrays="numpy", modes=("ALT_HOLD",))
-    assert PolicyDecider(noise_runner(one_mode), make_sampler()).contract is one_mode
+    assert (
+        PolicyDecider(noise_runner(one_mode), make_sampler(), SteppedClock()).contract is one_mode
+    )
 
 
 def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
