@@ -32,6 +32,9 @@ from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 
 LISTEN_S = 0.1
 """Longest wait for a message between two checks of the stop flag."""
+SILENT_WAITS = 3
+"""Waits in a row without a message after which a guard that holds the vehicle stands still: it
+reports each slot, every 50 ms at most."""
 OPEN_S = 20.0
 """Longest wait for the guard to start and to open the link. TCP alone may take three seconds, and
 the machine may be busy."""
@@ -118,6 +121,9 @@ class GuardProcess:
     def listen(self, stop: threading.Event, view: TelemetryCache) -> None:
         """Pass the guard's messages to ``view`` until it ends or ``stop`` is set.
 
+        A guard that stands still while it holds the vehicle is killed, since nothing may be sent in
+        its place while it lives.
+
         Raises:
             GuardDiedError: the guard has exited without its summary.
             PeerError, UserError: the error that the guard reported.
@@ -125,12 +131,8 @@ class GuardProcess:
         early, self._early = self._early, []
         for message in early:
             self._take(message, view)
-        while not stop.is_set():
-            select.select([self._port], [], [], LISTEN_S)
-            for data in self._port.receive():
-                self._take(decode_from_guard(data), view)
-            if self._port.is_closed:
-                break
+        if stands_still := self._stands_still(stop, view):
+            self._process.kill()
         if self.error is not None:
             raise self.error
         if self.summary is None and not stop.is_set():
@@ -140,9 +142,34 @@ class GuardProcess:
             if code == 0:  # it waits 2 s for its summary to be read
                 raise GuardDiedError("the guard ended the flight while this process stood still")
             by = f" (signal {-code})" if code is not None and code < 0 else ""
+            if stands_still:
+                by = f", killed after {SILENT_WAITS * LISTEN_S:g} s in which it stood still"
             raise GuardDiedError(f"the guard process has died{by}: {left}")
         if self.summary is not None and self.summary.failure is not None:
             raise PeerError(str(self.summary.failure))
+
+    def _stands_still(self, stop: threading.Event, view: TelemetryCache) -> bool:
+        """Pass messages on; return True once a guard that holds the vehicle sends none any more.
+
+        False: it has ended, or ``stop`` is set.
+        """
+        silent_waits = 0
+        while not (stop.is_set() or self._port.is_closed):
+            is_heard = bool(select.select([self._port], [], [], LISTEN_S)[0])
+            for data in self._port.receive():
+                self._take(decode_from_guard(data), view)
+            silent_waits = 0 if is_heard else silent_waits + 1
+            if silent_waits == SILENT_WAITS and self._holds_vehicle():
+                return True
+        return False
+
+    def _holds_vehicle(self) -> bool:
+        """True if the last words could be sent now, were the guard dead."""
+        newest, words = self._newest, self._words
+        if newest is None or words is None or not words.packets:
+            return False
+        silent_ns = self._clock.now_ns() - newest.sent_ns
+        return newest.phase in _STILL_OURS and silent_ns <= LATEST_NS
 
     def _take(self, message: FromGuard, view: TelemetryCache) -> None:
         match message:

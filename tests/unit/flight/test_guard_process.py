@@ -19,7 +19,12 @@ from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight import guard_process
-from mavbridge.flight.guard_process import LATEST_NS, GuardDiedError, GuardProcess
+from mavbridge.flight.guard_process import (
+    LATEST_NS,
+    SILENT_WAITS,
+    GuardDiedError,
+    GuardProcess,
+)
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
@@ -34,6 +39,7 @@ class Child:
     """The guard's process, which is gone when it is killed."""
 
     pid, returncode = 4321, None
+    kill: Callable[[], None]
 
     def wait(self, timeout_s: float) -> int:
         if self.returncode is None:
@@ -178,6 +184,43 @@ def test_a_fork_of_the_policy_does_not_hide_the_death_of_the_flight_process(rig:
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+
+
+@pytest.mark.parametrize("case", ["holds", "released", "heard", "too late", "knows no words"])
+def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
+    rig: Rig, case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, stop, waits = udp(), threading.Event(), 0
+    if case != "knows no words":
+        rig.tell(fd=link.fd, receiver=link.receiver)
+        os.close(link.fd)
+    rig.tick(Phase.RELEASED if case == "released" else Phase.FLYING)
+    if case == "too late":
+        rig.clock.advance_ns(LATEST_NS + MS)
+
+    def wait_in_vain(*ends: Any) -> Any:
+        nonlocal waits
+        waits += 1
+        if case == "heard" and waits == SILENT_WAITS:
+            rig.tick()
+        if waits == 2 * SILENT_WAITS:
+            stop.set()
+        return real_select(*ends[:3], 0.0)
+
+    def kill() -> None:
+        rig.child.returncode = -9
+        rig.port.close()
+
+    real_select, rig.child.kill = select.select, kill
+    monkeypatch.setattr(select, "select", wait_in_vain)
+    if case != "holds":
+        rig.guard.listen(stop, View())
+        assert link.heard() == []
+    else:
+        with pytest.raises(GuardDiedError, match=r"killed after 0\.3 s in which it stood still"):
+            rig.guard.listen(stop, View())
+        assert b"".join(link.heard()) == b"".join(WHOLE)
+    link.close()
 
 
 @pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])
