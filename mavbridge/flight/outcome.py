@@ -16,7 +16,7 @@ from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.guard.wire import GuardStatus, GuardSummary
-from mavbridge.recording.recorder import CrashWatch
+from mavbridge.recording.crash import CrashWatch
 
 _log = logging.getLogger(__name__)
 RUN_OUT_NS = NS_PER_S

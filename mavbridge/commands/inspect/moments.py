@@ -13,8 +13,8 @@ from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS, FlownChunk, FlownChunks
+from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
-from mavbridge.recording.recorder import CrashWatch
 from mavbridge.recording.rows import FrameRow
 
 Stamps: TypeAlias = NDArray[np.int64]

@@ -56,6 +56,14 @@ def test_the_simulator_says_what_it_lacks() -> None:
     assert refused.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
 
 
+@pytest.mark.parametrize("module", ["flight.app", "commands.check.run"])
+def test_a_flight_needs_no_extra(module: str) -> None:
+    code = "import sys; sys.modules.update(dict.fromkeys(['av', 'pyarrow.parquet', 'mujoco'])); "
+    code += f"import mavbridge.{module}"
+    imported = ended(sys.executable, "-c", code, cwd=ROOT)
+    assert imported.returncode == 0, imported.stderr
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd is installed here")
 def test_systemd_understands_the_unit(tmp_path: Path) -> None:
     unit = tmp_path / "mavbridge.service"

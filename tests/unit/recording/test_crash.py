@@ -8,7 +8,7 @@ import pytest
 from helpers.factories import make_state, make_tick
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
-from mavbridge.recording.recorder import CrashWatch
+from mavbridge.recording.crash import CrashWatch
 
 TICK_HZ = 100
 
