@@ -19,7 +19,7 @@ from policy.adapters.drafts import (
 )
 from policy.adapters.export import export_onnx
 from policy.adapters.lerobot.config import CONFIG_FILE
-from policy.data.lerobot import is_lerobot
+from policy.data.lerobot_format import is_lerobot
 from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
 from policy.errors import require_packages
 from policy.files import CONTRACT_FILE, UNANSWERED, read_text, read_toml

@@ -47,11 +47,6 @@ _MAX_EPISODES = 100_000
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
-def is_lerobot(folder: Path) -> bool:
-    """True for a LeRobot dataset of any version."""
-    return (folder / names.INFO).is_file()
-
-
 def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData]:
     """Read all episodes of a dataset.
 

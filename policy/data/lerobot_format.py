@@ -5,6 +5,7 @@ Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, info), ``datasets/dataset_w
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from policy.contract import StateFrame
 
@@ -46,6 +47,11 @@ def feature_names(feature: object) -> list[str] | None:
     if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
         names = next(iter(names.values()))
     return [str(name) for name in names] if isinstance(names, list) else None
+
+
+def is_lerobot(folder: Path) -> bool:
+    """True for a LeRobot dataset of any version."""
+    return (folder / INFO).is_file()
 
 
 def noted_frame(feature: Mapping[str, object]) -> object:

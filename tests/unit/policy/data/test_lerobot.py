@@ -15,7 +15,8 @@ import pytest
 from helpers.flight_folders import LEVEL, spot
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data.flight_data import DatasetError
-from policy.data.lerobot import is_lerobot, read_dataset
+from policy.data.lerobot import read_dataset
+from policy.data.lerobot_format import is_lerobot
 
 FPS, SIZE = 25, 32
 LENGTHS = (12, 8)
