@@ -223,7 +223,7 @@ class GraphFile:
             shapes[port] = list(wanted[role])
             declared = port.get_partial_shape()
             sizes = list(declared) if declared.rank.is_static else []
-            if declared.is_static and list(declared.to_shape()) == shapes[port][1:]:
+            if declared.is_static and [1, *declared.to_shape()] == shapes[port]:
                 shapes[port].pop(0)  # it has no axis for the batch
                 continue
             is_reshaped = role != "image" and 0 < len(sizes) != len(shapes[port])

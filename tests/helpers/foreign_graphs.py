@@ -81,8 +81,10 @@ def actor(
     save_graph(path, nodes, {state: (FLOAT, (1, state_dim))}, ends, {"w": weight}, **save)
 
 
-def recurrent(path: Path, *, hidden: Sequence[str] = ("h_in", "h_out")) -> None:
-    """Write a policy: obs [1, 13], hidden call counter [1, 1, 3] -> actions [1, 4].
+def recurrent(
+    path: Path, *, hidden: Sequence[str] = ("h_in", "h_out"), shape: Shape = (1, 1, 3)
+) -> None:
+    """Write a policy: obs [1, 13], hidden call counter of a shape -> actions [1, 4].
 
     Names are those of Isaac Lab's exporter. Throttle is a tenth of the number of calls so far.
     """
@@ -96,12 +98,12 @@ def recurrent(path: Path, *, hidden: Sequence[str] = ("h_in", "h_out")) -> None:
         helper.make_node("Add", ["zeros", "up"], ["actions"]),
     ]
     weights = {
-        "one": np.ones((1, 1, 3), np.float32),
+        "one": np.ones(shape, np.float32),
         "w": np.zeros((13, 4), np.float32),
         "tenth": np.array(0.1, np.float32),
         "unit": np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
     }
-    state = (FLOAT, (1, 1, 3))
+    state = (FLOAT, shape)
     save_graph(
         path,
         nodes,

@@ -284,6 +284,12 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     require_counting(fly(f"onnx:{tmp_path}"))
 
 
+def test_a_hidden_state_may_be_one_number(tmp_path: Path) -> None:
+    graphs.write_contract(tmp_path)
+    graphs.recurrent(tmp_path / "policy.onnx", shape=())
+    require_counting(fly(f"onnx:{tmp_path}"))
+
+
 @pytest.mark.parametrize(
     ("kind", "white"), [(TensorProto.FLOAT16, 1.0), (TensorProto.UINT8, 255.0)]
 )
