@@ -209,9 +209,11 @@ def _require_order(spec: str, policy: object) -> None:
     for method, seen in (("predict", "image"), ("predict_fast", "feature")):
         roles = (seen, "state", "action_history")
         try:
-            names = [*inspect.signature(getattr(policy, method)).parameters]
+            parameters = inspect.signature(getattr(policy, method)).parameters.values()
         except (AttributeError, TypeError, ValueError):  # no such method, or none in Python
             continue
+        passed = [each.name for each in parameters if each.kind is not each.KEYWORD_ONLY]
+        names = passed[: len(roles) + 1]
         is_told = not any(name.startswith("obs") for name in names)  # any input may be one
         if is_told and not is_ordered(names, roles):
             raise PolicyError(

@@ -249,6 +249,11 @@ class Observing(Single):
         return np.full((1, 16, 4), 0.5, np.float32)
 
 
+class Keeping(Single):
+    def predict(self, frame, vehicle, past, steps, rgb=None, *, state=None):
+        return np.full((1, 16, 4), 0.5, np.float32)
+
+
 class ResetNeedsMore(Single):
     def reset(self, seed):
         pass
@@ -330,8 +335,11 @@ def test_an_unusable_class_is_refused(mine, name, changes, message):
         load(f"{mine}:{name}", **changes)
 
 
-def test_any_input_may_be_called_an_observation(mine: str) -> None:
-    assert throttle(load(f"{mine}:Observing")) == 0.5
+@pytest.mark.parametrize("name", ["Observing", "Keeping"])
+def test_only_inputs_that_are_passed_need_an_order_and_any_may_be_an_observation(
+    mine: str, name: str
+) -> None:
+    assert throttle(load(f"{mine}:{name}")) == 0.5
 
 
 @pytest.mark.parametrize("name", ["FastPair", "RegisteredPair"])
