@@ -23,7 +23,7 @@ from policy.errors import require_packages
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = ("mss", "Xlib")
-"""Packages of the extra "screen": import name to pip name."""
+"""Modules of the extra "screen"."""
 NO_CAMERA = "none"
 BLANK_NS = NS_PER_S // 30
 """Period of the black frames for ``none``."""

@@ -225,7 +225,7 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
 def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
     """Return how a recorded flight differs from the one to fly, in words; empty if it does not."""
     config = spec.config
-    size_px = meta.contract and meta.contract.image_height
+    size_px = meta.contract.image_height
     asked_px = size_px if config.has_student else config.policy.image_size or SIM_CAMERA_PX
     pairs = {
         "source": (meta.source, "dagger" if config.has_student else "demonstration"),

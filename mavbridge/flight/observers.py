@@ -32,11 +32,10 @@ from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_document
-from mavbridge.recording.folder import remove_flight
+from mavbridge.recording.folder import FlightMeta, remove_flight, write_meta
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
-    from mavbridge.recording.folder import FlightMeta
     from mavbridge.recording.recorder import Recorder
 
 RERUN_CAPACITY = 1000
@@ -136,7 +135,6 @@ class FlightObservers:
         """
         if self._config.record is None or guard.tlog_pipe is None:
             return
-        from mavbridge.recording.folder import FlightMeta
         from mavbridge.recording.recorder import Recorder
         from mavbridge.recording.replay_files import ReplaySettings
 
@@ -184,10 +182,8 @@ class FlightObservers:
             params = {} if summary is None else summary.params
             self._write_end(replace(meta, parameters=params), self._config.record)
 
-    def _write_end(self, meta: "FlightMeta", folder: Path) -> None:
+    def _write_end(self, meta: FlightMeta, folder: Path) -> None:
         """Add the outcome and the vehicle's parameters to ``meta.json``."""
-        from mavbridge.recording.folder import write_meta
-
         try:
             write_meta(folder, meta)
         except OSError as error:
