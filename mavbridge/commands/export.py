@@ -213,7 +213,7 @@ def write_dataset(
 
 
 def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
-    """Write the contract file of a policy trained on a dataset of these flights."""
+    """Write the contract file for policies trained on these flights; raise DatasetError."""
     kind = "flight folder"
     metas = [read_object(flight / "meta.json", DatasetError, kind) for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
@@ -242,7 +242,8 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
     """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
     An empty folder that is there may be a mounted one, which is not replaced: it gets the contents.
-    SIGTERM ends the block as Ctrl-C does, and no folder stays.
+    SIGTERM ends the block as Ctrl-C does, and no folder stays. Raises UserError if ``out`` is
+    taken.
     """
     place = Path(os.path.realpath(out))
     try:

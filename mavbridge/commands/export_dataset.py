@@ -253,7 +253,7 @@ class DatasetWriter:
         }
 
     def finish(self) -> None:
-        """Write the files that describe the whole dataset."""
+        """Write the files about the whole dataset; raise VideoError if no episode had images."""
         if self.rows == 0:
             raise VideoError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)

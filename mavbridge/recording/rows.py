@@ -154,7 +154,7 @@ def attributes(source: object | None, names: Iterable[str]) -> Row:
 
 
 def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
-    """Return the records of a table of ticks whose actions are of this kind."""
+    """Return the ticks of a table with actions of this kind; raise FlightError for torn ones."""
     for whole, parts in (("state", STATE_STAMPS), ("raw", ActionTrace._fields)):
         there = table.filter(table[whole].is_valid())
         if torn := [name for name in parts if there[name].null_count]:

@@ -169,7 +169,7 @@ class Soak:
 
 
 def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
-    """Load the policy of ``config``, and fly the bundled vehicle for ``duration_s``."""
+    """Load the policy, and fly the bundled vehicle for ``duration_s``; raise MavbridgeError."""
     port = free_port()
     with ExitStack() as stack:
         loaded = stack.enter_context(load_configured_policy(config.policy, clock))
@@ -210,7 +210,7 @@ def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: st
 
 
 def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Soak:
-    """Fly ``config.duration`` with a loaded policy, and measure it."""
+    """Fly a loaded policy, and measure it; raise PeerError if the flight ended early."""
     plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
     timing = FlightTiming(
         stick_hz=config.rates.stick_rate,

@@ -68,7 +68,7 @@ class Sampler:
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
     ) -> tuple[Tensor, FloatArray, FloatArray]:
-        """Simulate the actions [frames, 4], or sample actions if they are None.
+        """Simulate the actions [frames, 4], or sample ones if None; raise RolloutError for NaN.
 
         Return latents [frames, C, h, w], on the model's device, states [frames, 13] and actions.
 
@@ -274,7 +274,7 @@ class Segment:
 def rollout(
     sampler: Sampler, decider: Decider, start: RolloutStart, plan: RolloutPlan
 ) -> Iterator[Segment]:
-    """Imagine one iteration per step. Only the observation carries over between iterations.
+    """Imagine an iteration per step; only the observation carries over. Raises RolloutError.
 
     Only frames that the decider uses are decoded here: those of the executed steps that will still
     be in its queue, and none after the last iteration.

@@ -91,7 +91,7 @@ def run_rollout(
     output: StreamedOutput,
     console: Console,
 ) -> bool:
-    """Run the iterations; return True if a signal ended them early."""
+    """Run the iterations; return True if a signal ended them early. Raises RolloutError."""
     done = 0
     try:
         with stop_on_signals() as stop, progress_bar(console) as bar:
@@ -138,7 +138,7 @@ def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
-    """Read the context, from ``start_s`` after the first frame that has a state, or raise."""
+    """Read the context, from ``start_s`` after the first state, or raise UserError, VideoError."""
     _require_same_kind(flight, config)
     captured_ns = flight.frames["captured_ns"].to_numpy()
     ticks = flight.ticks.filter(flight.ticks["state"].is_valid())
