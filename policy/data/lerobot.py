@@ -324,14 +324,14 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
     """Return the noted frame, or that of the contract file; else tell it by gravity."""
     noted = names.noted_frame(info.features[names.STATE_KEY])
-    frames = {each for each in (noted, info.told_frame) if each is not None}
-    if len(frames) > 1 or not frames <= set(get_args(StateFrame)):
+    frames = [each for each in (noted, info.told_frame) if each is not None]
+    if any(each != frames[0] or each not in get_args(StateFrame) for each in frames):
         raise DatasetError(
             f"{row.name}: its state frame is {noted!r}, in {CONTRACT_FILE} {info.told_frame!r}; "
             f"known are {list(get_args(StateFrame))}"
         )
     if frames:
-        return cast(StateFrame, frames.pop())
+        return cast(StateFrame, frames[0])
     az_mps2 = float(np.median(state[:, SPECIFIC_FORCE][:, 2]))
     if (frame := names.frame_by_gravity(az_mps2)) is None:
         raise DatasetError(

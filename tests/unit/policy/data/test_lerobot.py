@@ -195,6 +195,7 @@ def _ragged(table: pa.Table) -> pa.Table:
         (_info(lambda info: info["features"].update(TWO_CAMERAS)), "--camera-key"),
         (_state(names=list(STATE_NAMES[::-1])), "in this order"),
         (_state(info={"state_frame": "body"}), "state frame is 'body'"),
+        (_state(info={"state_frame": ["ned_frd"]}), "state frame is .'ned_frd'., in "),
         (_rows("observation.state", _nan), "NaN or infinity in row 3"),
         (_table(_ragged), "action must hold 4 numbers a row"),
         (_rows("timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
