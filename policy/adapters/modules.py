@@ -7,6 +7,7 @@ declares are not passed. An archive may have methods with these names, and a pol
 
 import inspect
 import json
+import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -121,7 +122,7 @@ class ForwardPolicy(nn.Module):
     def to_chunk(self, sample: Any) -> Any:
         """Convert the policy's actions [1, L, 4] to the contract's; axes of 1 may be missing."""
         wanted = (1, self.contract.horizon, ACTION_DIM)
-        if (1, 1, *sample.shape)[-3:] == wanted:
+        if (1, 1, *sample.shape)[-3:] == wanted and math.prod(sample.shape) == math.prod(wanted):
             sample = sample.reshape(wanted)
         return self._interface.to_actions(sample)
 

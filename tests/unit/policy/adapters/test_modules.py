@@ -158,6 +158,19 @@ def test_one_input_that_may_be_a_state_or_an_image_is_not_guessed(tmp_path: Path
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(0.5, abs=1e-3)
 
 
+class TwoChunks(nn.Module):
+    def forward(self, image: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(2, 1, 8, 4) + state.sum()
+
+
+def test_more_chunks_than_one_are_refused_by_their_shape(tmp_path: Path) -> None:
+    path = archive(tmp_path, TwoChunks(), described())
+    with pytest.raises(
+        PolicyError, match=r"must be \[1, 8, 4\] by its contract, got \[2, 1, 8, 4\]"
+    ):
+        load(f"torchscript:{path}", dual_rate=False)
+
+
 class ImageAsObs(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)
