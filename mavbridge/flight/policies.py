@@ -83,8 +83,8 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
         files += sorted(each for each in path.iterdir() if each.suffix in POLICY_SUFFIXES)
     elif path.is_file():
         files.append(path)
-        beside = sorted(path.parent.iterdir()) if wanted.kind in FILE_KINDS else []
-        files += [each for each in beside if each.name in BESIDE or each.stem == path.name]
+        beside = (f"{path.name}.data", *BESIDE) if wanted.kind in FILE_KINDS else ()
+        files += filter(Path.is_file, map(path.with_name, beside))
     return files
 
 

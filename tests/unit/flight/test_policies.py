@@ -131,8 +131,15 @@ def test_a_camera_that_is_not_there_is_needed_only_by_who_looks(
 
 
 @pytest.mark.parametrize("policy", ["onnx:{}/a.onnx", "torchscript:{}/a.pt"])
-def test_what_is_read_beside_one_file_belongs_to_it(tmp_path: Path, policy: str) -> None:
+def test_what_is_read_beside_one_file_belongs_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
+) -> None:
     """Otherwise --resume mixes flights by other weights or another contract."""
+
+    def unlisted(_: Path) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "iterdir", unlisted)  # a folder that may only be entered
     names = ("a.onnx", "a.onnx.data", "a.pt", "a.pt.data", "policy.json", "mavbridge.toml")
     for name in (*names, "b.onnx", "b.onnx.data", "b.pt"):
         (tmp_path / name).write_text("")
