@@ -9,7 +9,7 @@ import re
 import sys
 from collections import UserDict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from functools import _lru_cache_wrapper, partial
 from gc import get_referents
 from io import IOBase
 from itertools import count, islice
@@ -39,8 +39,9 @@ MAX_HELD = 10_000
 """Largest number of objects that are searched for a policy's modules and memory."""
 _WRAPPERS = (partial, MethodType, CellType, staticmethod, classmethod, property)
 _COLLECTIONS = (list, tuple, dict, set, frozenset, deque, *_WRAPPERS)
-_OPENED = (*_COLLECTIONS, SimpleNamespace, UserDict, Queue, nn.Module)
-"""Types that are searched beside those of packages outside ``_LIBRARIES``."""
+_OPENED = (*_COLLECTIONS, _lru_cache_wrapper, SimpleNamespace, UserDict, Queue, nn.Module)
+"""Types that are searched beside those of packages outside ``_LIBRARIES``; a cached function not
+for its results."""
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
 _OURS = ("policy", "mavbridge")
 _OF_TORCH = frozenset(vars(nn.Module()))

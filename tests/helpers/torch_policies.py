@@ -4,7 +4,7 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -194,6 +194,11 @@ def counter_in_closure() -> Callable[[], None]:
         calls += 1
 
     return count
+
+
+@lru_cache(maxsize=0)
+def count_in_cached() -> None:
+    COUNTED.calls += 1
 
 
 class Counter:

@@ -72,6 +72,7 @@ def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason,
         *(torch_policies.count_in_attribute, torch_policies.counter_in_closure()),
         *(
             Counter().count,
+            torch_policies.count_in_cached,
             partial(Counter.count, Counter()),
         ),
     ],
