@@ -184,9 +184,10 @@ class FlightAnalysis:
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
-    flight, *others = open_cameras(folder)
+    opened = open_cameras(folder)
+    flight = opened[0]
     contract = flight.meta.contract
-    cameras = dict(zip(contract.cameras, (flight, *others), strict=True))
+    cameras = dict(zip(contract.cameras, opened, strict=True))
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
     damage = [text for camera in cameras.values() for text in camera.damage]
@@ -203,7 +204,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         cameras=cameras,
         start_ns=start_ns,
         stick_hz=stick_hz,
-        report=_report(flight, ticks, frames, stick_hz),
+        report=_report(opened, ticks, frames, stick_hz),
         image_latency_ms={name: _image_latency_ms(each) for name, each in cameras.items()},
         track=_track(ticks, frames, start_ns),
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
@@ -229,10 +230,10 @@ def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
 
 
 def _report(
-    flight: RecordedFlight, ticks: list[Tick], frames: list[FrameRow], stick_hz: float
+    cameras: Sequence[RecordedFlight], ticks: list[Tick], frames: list[FrameRow], stick_hz: float
 ) -> TimingReport:
     """Count the rows as in flight, except for figures that only a live flight has."""
-    meta = flight.meta
+    meta = cameras[0].meta
     timing = FlightTiming(stick_hz=stick_hz, action_hz=meta.action_hz, vision_hz=meta.visual_hz)
     for tick in _with_gaps(ticks):
         timing.emit(tick)
@@ -241,7 +242,7 @@ def _report(
         engine=meta.engine or "an engine that is not known",
         policy=meta.policy or meta.source,
         autopilot=meta.autopilot,
-        observer_drops=ObserverDrops(recorder=_losses(flight)),
+        observer_drops=ObserverDrops(recorder=_losses(cameras)),
         outcome=meta.outcome,
     )
     return replace(report, vision=_vision(frames, meta.visual_hz))
@@ -256,13 +257,13 @@ def _with_gaps(ticks: Sequence[Tick]) -> Iterator[Tick]:
         yield tick
 
 
-def _losses(flight: RecordedFlight) -> int:
+def _losses(cameras: Sequence[RecordedFlight]) -> int:
     """Return the recorder's losses; of a recording that was cut off, up to its last row."""
-    meta = flight.meta
+    meta = cameras[0].meta
     counts = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
     if any(count is not None for count in counts):
         return sum(count or 0 for count in counts)
-    tables = (flight.ticks, *(camera.frames for camera in open_cameras(flight.folder)))
+    tables = (cameras[0].ticks, *(camera.frames for camera in cameras))
     return sum(sum(table.column("dropped_before").to_pylist()) for table in tables)
 
 
