@@ -180,12 +180,12 @@ class FlightScreen(MessageScreen):
         self.show_message(tick.activity)
 
     def show_report(self, report: TimingReport) -> None:
-        """Show the table of measurements and the verdicts with the next refresh."""
+        """Show the table of measurements and the findings with the next refresh."""
         if (table := timing_table(report)) is not None:
             self._messages.put(table, soft_wrap=False)
-        for verdict in verdicts(report):
-            _said.info("%s", verdict.line.plain)
-            self._messages.put(verdict.line, soft_wrap=not self._console.is_terminal)
+        for finding in findings(report):
+            _said.info("%s", finding.line.plain)
+            self._messages.put(finding.line, soft_wrap=not self._console.is_terminal)
 
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
@@ -274,7 +274,7 @@ def timing_table(report: TimingReport) -> Table | None:
     return table
 
 
-class Verdict(NamedTuple):
+class Finding(NamedTuple):
     """Result of one part of a flight."""
 
     name: str
@@ -288,34 +288,34 @@ class Verdict(NamedTuple):
         return Text.assemble((f"{self.name:9}", "bold"), (self.text, self.style))
 
 
-def verdicts(report: TimingReport) -> list[Verdict]:
-    """Return a verdict on each part of a flight, with its target and its result."""
+def findings(report: TimingReport) -> list[Finding]:
+    """Return a finding on each part of a flight, with its target and its result."""
     sticks, action, vision = report.sticks, report.action, report.vision
     missed = f"{_counted(sticks.missed_slots, 'slot')} of {sticks.slots} missed"
     style = GOOD if not sticks.missed_slots else POOR
     coasting = f"{_counted(sticks.coasting_sends, 'send')} coasting"
     text = f"{sticks.target_hz:g} Hz grid, {missed}, {coasting}"
-    lines = [Verdict("sticks", text, style if sticks.slots else BAD)]
+    lines = [Finding("sticks", text, style if sticks.slots else BAD)]
     late = f"{_counted(action.late_chunks, 'late chunk')} of {action.chunks}"
     dropped = "frames dropped by the camera not measured"
     if vision.dropped_frames is not None:
         dropped = f"{_counted(vision.dropped_frames, 'frame')} dropped by the camera"
     for name, loop, rest in (("action", action, late), ("vision", vision, dropped)):
         text = f"{number(loop.rate_hz, 1)} Hz of {loop.target_hz:.4g} Hz, {rest}"
-        lines.append(Verdict(name, text, rate_style(loop.rate_hz, loop.target_hz)))
+        lines.append(Finding(name, text, rate_style(loop.rate_hz, loop.target_hz)))
     if report.link is not None:
-        lines.append(Verdict("link", _link_verdict(report.link)))
-    lines.append(Verdict("releases", _release_verdict(report)))
+        lines.append(Finding("link", _link_text(report.link)))
+    lines.append(Finding("releases", _release_text(report)))
     drops = {"rerun": report.observer_drops.rerun, "recorder": report.observer_drops.recorder}
     lines += [
-        Verdict(name, f"missed {_counted(count, 'event')}", POOR)
+        Finding(name, f"missed {_counted(count, 'event')}", POOR)
         for name, count in drops.items()
         if count
     ]
     return lines
 
 
-def _link_verdict(link: LinkStats) -> str:
+def _link_text(link: LinkStats) -> str:
     echo = {True: "echo confirmed", False: "NO ECHO from the vehicle", None: "echo not checked"}
     lost = (
         "loss not measured"
@@ -330,7 +330,7 @@ def _link_verdict(link: LinkStats) -> str:
     return f"{sent}, {echo[link.echo_confirmed]}, {lost}{limits}"
 
 
-def _release_verdict(report: TimingReport) -> str:
+def _release_text(report: TimingReport) -> str:
     if not report.releases:
         return "never released"
     last = report.releases[-RELEASES_SHOWN:]

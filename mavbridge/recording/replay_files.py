@@ -1,5 +1,5 @@
-"""What a replay needs beside the ticks: every setting of the flight (``settings.json``), and tables
-of the policy's solves, features and packet stamps."""
+"""Files of a recorded flight for a replay: all settings (``settings.json``), and tables of the
+policy's solves, features and packet stamps."""
 
 import json
 from collections.abc import Iterator

@@ -28,7 +28,7 @@ from mavbridge.core.records import Position, Solve, Tick
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.observe.terminal import BAD, POOR, Verdict, number, rate_style, verdicts
+from mavbridge.observe.terminal import BAD, POOR, Finding, findings, number, rate_style
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording import replay_files
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
@@ -347,42 +347,42 @@ def recorded_solves(flight: RecordedFlight) -> Iterator[Solve]:
         yield from replay_files.read_solves(table, flight.meta.contract)
 
 
-def flight_facts(flight: FlightAnalysis) -> Iterator[Verdict]:
+def flight_facts(flight: FlightAnalysis) -> Iterator[Finding]:
     """Yield losses, crash, course and path of a flight."""
     meta = flight.meta
     if meta.loss is not None:
-        yield Verdict("recording", meta.loss, POOR)
+        yield Finding("recording", meta.loss, POOR)
     if meta.crash is not None:
-        yield Verdict("crashed", meta.crash, BAD)
+        yield Finding("crashed", meta.crash, BAD)
     for text in flight.damage:
-        yield Verdict("damage", text, BAD)
+        yield Finding("damage", text, BAD)
     if meta.gates_passed is not None:
         result = {True: "finished", False: "not finished", None: "no verdict"}[meta.success]
         text = f"{meta.course_seed}: {meta.gates_passed} gates passed, {result}"
-        yield Verdict("course", text, BAD if meta.success is False else "")
+        yield Finding("course", text, BAD if meta.success is False else "")
     if (track := flight.track) is not None:
         highest_m = -track.position_ned_m[:, 2].min()
-        yield Verdict("path", f"{track.length_m:.0f} m, highest {highest_m:.1f} m")
+        yield Finding("path", f"{track.length_m:.0f} m, highest {highest_m:.1f} m")
 
 
-def flight_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:
-    """Yield the verdicts on the loops, or on a pilot's rows; then image latencies and causes."""
+def flight_findings(flight: FlightAnalysis) -> Iterator[Finding]:
+    """Yield the findings on the loops, or on a pilot's rows; then image latencies and causes."""
     report = flight.report
     if flight.meta.source == "pilot":
-        yield from _pilot_verdicts(flight)
+        yield from _pilot_findings(flight)
     else:
-        yield from verdicts(report)
+        yield from findings(report)
     for camera, latency in flight.image_latency_ms.items():
         if latency is not None:
             text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
-            yield Verdict("images", f"{camera}: {text}" if len(flight.cameras) > 1 else text)
+            yield Finding("images", f"{camera}: {text}" if len(flight.cameras) > 1 else text)
     if flight.causes:
         causes = ", ".join(f"{cause} ({count})" for cause, count in flight.causes)
-        yield Verdict("causes", causes, POOR)
+        yield Finding("causes", causes, POOR)
 
 
-def _pilot_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:
-    """Yield the verdicts on a recording in which no policy flew."""
+def _pilot_findings(flight: FlightAnalysis) -> Iterator[Finding]:
+    """Yield the findings on a recording in which no policy flew."""
     report, sticks = flight.report, flight.ticks["rc_sticks"]
     is_timed = len(sticks) > 1 and report.duration_s > 0
     rows_hz = (len(sticks) - 1) / report.duration_s if is_timed else None
@@ -393,6 +393,6 @@ def _pilot_verdicts(flight: FlightAnalysis) -> Iterator[Verdict]:
         ("vision", report.vision.rate_hz, report.vision.target_hz, ""),
     ):
         text = f"{number(rate_hz, 1)} Hz of {target_hz:.4g} Hz{rest}"
-        yield Verdict(name, text, rate_style(rate_hz, target_hz))
+        yield Finding(name, text, rate_style(rate_hz, target_hz))
     if report.observer_drops.recorder:
-        yield Verdict("recorder", f"missed {report.observer_drops.recorder} events", POOR)
+        yield Finding("recorder", f"missed {report.observer_drops.recorder} events", POOR)

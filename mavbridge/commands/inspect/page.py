@@ -17,7 +17,7 @@ from mavbridge.commands.inspect.analysis import (
     FlightAnalysis,
     FloatColumn,
     flight_facts,
-    flight_verdicts,
+    flight_findings,
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.files import write_output
@@ -92,8 +92,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "policy", f"{report.policy} on {report.engine}, {report.mode} rate", False
     yield "vehicle", report.autopilot or "none", False
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
-    for verdict in (*flight_facts(flight), *flight_verdicts(flight)):
-        yield verdict.name, verdict.text, verdict.style in (POOR, BAD)
+    for finding in (*flight_facts(flight), *flight_findings(flight)):
+        yield finding.name, finding.text, finding.style in (POOR, BAD)
     for name, measured in flight.times_ms.items():
         if measured is not None:
             p50, p99 = f"p50 {measured.p50:.2f}", f"p99 {measured.p99:.2f}"

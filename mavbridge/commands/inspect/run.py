@@ -16,7 +16,7 @@ from mavbridge.commands.inspect.analysis import (
     FlightAnalysis,
     analyse,
     flight_facts,
-    flight_verdicts,
+    flight_findings,
     recorded_solves,
 )
 from mavbridge.commands.inspect.page import write_page
@@ -27,7 +27,7 @@ from mavbridge.core.files import require_writable
 from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
-from mavbridge.observe.terminal import BAD, Verdict, number, timing_table
+from mavbridge.observe.terminal import BAD, Finding, number, timing_table
 from mavbridge.observe.timing import report_document
 from mavbridge.observe.viewer import RerunView
 from mavbridge.observe.viewer_layout import ViewedFlight
@@ -67,8 +67,8 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
         console.print(fact.line)
     if (table := timing_table(flight.report)) is not None:
         console.print(table)
-    for verdict in flight_verdicts(flight):
-        console.print(verdict.line)
+    for finding in flight_findings(flight):
+        console.print(finding.line)
     console.print(_holders_table(flight))
     console.print(_moments_table(flight))
 
@@ -129,7 +129,7 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
     console.print(table)
     for flight in flights:
         for text in flight.damage:
-            console.print(Verdict("damage", text, BAD).line)
+            console.print(Finding("damage", text, BAD).line)
 
 
 def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:

@@ -8,12 +8,12 @@ from helpers.factories import START_NS, TICK_NS, make_released_tick, make_tick
 from helpers.reports import report_of
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import LinkStats
-from mavbridge.observe.terminal import timing_table, verdicts
+from mavbridge.observe.terminal import findings, timing_table
 from mavbridge.observe.timing import TimingReport
 
 
 def verdict_lines(report: TimingReport) -> list[str]:
-    return [verdict.line.plain for verdict in verdicts(report)]
+    return [finding.line.plain for finding in findings(report)]
 
 
 def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
@@ -74,4 +74,4 @@ def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
 )
 def test_a_policy_that_misses_its_rate_is_not_green(period_ns: int, style: str) -> None:
     ticks = [make_tick(k, woke_ns=START_NS + k * period_ns) for k in range(101)]
-    assert verdicts(report_of(*ticks))[1].style == style
+    assert findings(report_of(*ticks))[1].style == style
