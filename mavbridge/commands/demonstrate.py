@@ -12,7 +12,7 @@ from mavbridge.commands.demonstrate_pilot import Pilot, Variation, draw_variatio
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
 from mavbridge.config.episodes import DemonstrateConfig
-from mavbridge.config.policy import SIM_CAMERA_PX, Rates
+from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.provenance import digests
@@ -22,7 +22,7 @@ from mavbridge.flight.policies import load_for_episodes, policy_files
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import META, FlightMeta, prepare_folder, read_meta
 from mavbridge.recording.rows import FrameTruth
-from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from mavbridge.simulation.flight import SIM_CAMERA_PX, SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import Contract
 from policy.protocol import PolicyRunner

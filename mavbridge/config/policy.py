@@ -20,13 +20,6 @@ SOLVES_PER_PLAY = 2.0
 late."""
 STATE_HZ = 50.0
 """Lowest requested telemetry rate, however slow the actions: age limits are in seconds."""
-SIM_CAMERA_HZ = 30.0
-"""Frame rate of the simulated camera, unless the visual rate is higher."""
-SIM_CAMERA_PX = 224
-"""Side of its frames in pixels, as ``python -m sitl`` sends them. The bridge resizes them like
-those of a real camera."""
-STATUS_HZ = 5.0
-"""Refresh rate of the terminal."""
 
 
 @Parameter(name="*", group=POLICY)

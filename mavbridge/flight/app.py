@@ -13,7 +13,6 @@ from rich.text import Text
 
 from mavbridge.camera.open import open_camera
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.policy import STATUS_HZ
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
@@ -37,6 +36,7 @@ from mavbridge.flight.state import observation_ages_ns
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import patient_console
+from mavbridge.observe.terminal import STATUS_HZ
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 from policy.protocol import PolicyRunner

@@ -11,7 +11,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from mavbridge.config.policy import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.log import SAID, is_log_thread
 from mavbridge.core.provenance import without_secrets
@@ -23,6 +22,8 @@ from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_sh
 from mavbridge.observe.timing import TimingReport
 
 _said = logging.getLogger(SAID)
+STATUS_HZ = 5.0
+"""Refresh rate of the terminal."""
 RATE_WINDOW_S = 1.0
 ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0

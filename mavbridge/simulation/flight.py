@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.policy import SIM_CAMERA_HZ, SIM_CAMERA_PX
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
@@ -46,6 +45,11 @@ MAX_TIME_S = 60.0
 """Default limit [s]: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
 END_NS = 3 * NS_PER_S
 """Longest time for the guard to return the sticks."""
+SIM_CAMERA_HZ = 30.0
+"""Frame rate of the simulated camera, unless the visual rate is higher."""
+SIM_CAMERA_PX = 224
+"""Side of its frames in pixels, as ``python -m sitl`` sends them. The bridge resizes them like
+those of a real camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
