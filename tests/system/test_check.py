@@ -50,7 +50,8 @@ def test_a_soak_measures_this_computer_at_the_bundled_vehicle(tmp_path: Path) ->
     document = json.loads(report.read_text())
     soak = document["soak"]
     assert soak["timing"]["sticks"]["slots"] > 80
-    assert soak["timing"]["sticks"]["lateness_ms"]["p50"] > 0
+    # No lateness: where every chunk is sent just before its slot, no slot is left to send in.
+    assert soak["timing"]["state_to_wire_ms"]["p50"] > 0
     assert soak["timing"]["action"]["rate_hz"] > 0
     assert soak["timing"]["vision"]["rate_hz"] > 0
     assert 0 < soak["cpu_cores"]["guard"] < 1
