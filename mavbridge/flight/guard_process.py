@@ -169,7 +169,7 @@ class GuardProcess:
         if newest is None or words is None or not words.packets:
             return False
         silent_ns = self._clock.now_ns() - newest.sent_ns
-        return newest.phase in _STILL_OURS and silent_ns <= LATEST_NS
+        return newest.phase in (words.phase, *_STILL_OURS) and silent_ns <= LATEST_NS
 
     def _take(self, message: FromGuard, view: TelemetryCache) -> None:
         match message:

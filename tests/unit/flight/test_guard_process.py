@@ -186,15 +186,19 @@ def test_a_fork_of_the_policy_does_not_hide_the_death_of_the_flight_process(rig:
         os.waitpid(child, 0)
 
 
-@pytest.mark.parametrize("case", ["holds", "released", "heard", "too late", "knows no words"])
+@pytest.mark.parametrize(
+    "case", ["holds", "prepares", "released", "heard", "too late", "knows no words"]
+)
 def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
     rig: Rig, case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link, stop, waits = udp(), threading.Event(), 0
+    phase = {"prepares": Phase.PREPARING, "released": Phase.RELEASED}.get(case, Phase.FLYING)
     if case != "knows no words":
-        rig.tell(fd=link.fd, receiver=link.receiver)
+        told = Phase.FLYING if case == "released" else phase
+        rig.tell(told, fd=link.fd, receiver=link.receiver)
         os.close(link.fd)
-    rig.tick(Phase.RELEASED if case == "released" else Phase.FLYING)
+    rig.tick(phase)
     if case == "too late":
         rig.clock.advance_ns(LATEST_NS + MS)
 
@@ -213,7 +217,7 @@ def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
 
     real_select, rig.child.kill = select.select, kill
     monkeypatch.setattr(select, "select", wait_in_vain)
-    if case != "holds":
+    if case not in ("holds", "prepares"):
         rig.guard.listen(stop, View())
         assert link.heard() == []
     else:
