@@ -155,10 +155,17 @@ def test_a_server_that_comes_back_is_flown_again(contract_file: Path) -> None:
             predict_until(policy, lambda found: found == pytest.approx(0.2))
 
 
-def test_a_server_of_another_policy_is_not_flown() -> None:
-    with our_server(served_echo()) as port:
-        policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
-    with closing(policy), scripted_server(lambda _: chunk_of(0.2), port=port):
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_server_of_another_policy_is_not_flown(contract_file: Path, is_ours: bool) -> None:
+    def reply(_: Message) -> Reply:
+        return chunk_of(0.2)
+
+    rgb, bgr = (
+        pack({"mavbridge_fields": json.dumps({"image_channels": each})}) for each in ("rgb", "bgr")
+    )
+    with our_server(served_echo()) if is_ours else scripted_server(reply, greeting=rgb) as at:
+        policy, _ = load_server_policy(f"ws://127.0.0.1:{at}", None if is_ours else contract_file)
+    with closing(policy), scripted_server(reply, port=at, greeting=bgr):
         predict_until(policy, lambda found: "serves another policy now" in str(found))
 
 

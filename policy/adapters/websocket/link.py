@@ -17,7 +17,13 @@ from websockets.exceptions import (
     WebSocketException,
 )
 
-from policy.adapters.websocket.messages import CONTRACT_KEY, Message, MessageError, unpack
+from policy.adapters.websocket.messages import (
+    CONTRACT_KEY,
+    FIELDS_KEY,
+    Message,
+    MessageError,
+    unpack,
+)
 from policy.errors import NoChunkError, PolicyError
 
 API_KEY_VARIABLE = "MAVBRIDGE_API_KEY"
@@ -146,7 +152,8 @@ class ServerLink:
             metadata = unpack(await connection.recv())
         if not self._metadata.done():
             self._metadata.set_result(metadata)
-        elif metadata.get(CONTRACT_KEY) != self._metadata.result().get(CONTRACT_KEY):
+        first = self._metadata.result()
+        if any(metadata.get(key) != first.get(key) for key in (CONTRACT_KEY, FIELDS_KEY)):
             raise PolicyError(f"{self._url} serves another policy now: start the flight again")
         self._problem = None
         closing = asyncio.ensure_future(connection.wait_closed())
