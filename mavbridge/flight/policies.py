@@ -23,10 +23,11 @@ from policy.nets.names import BUILTIN_KINDS
 NO_IMAGE_ADVICE = "uses no image: give --camera none"
 STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
-POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
+POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".onnx_data", ".pt", ".json", ".toml")
 """Suffixes of the files in a policy's folder that belong to it."""
 BESIDE = (CONTRACT_FILE, DESCRIPTION)
-"""Files that are read beside a policy of one file, with its external weights, FILE.data."""
+"""Files that are read beside a policy of one file, with its external weights: FILE.data by torch,
+FILE_data by Optimum."""
 
 
 def load_configured_policy(
@@ -83,7 +84,8 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
         files += sorted(each for each in path.iterdir() if each.suffix in POLICY_SUFFIXES)
     elif path.is_file():
         files.append(path)
-        beside = (f"{path.name}.data", *BESIDE) if wanted.kind in FILE_KINDS else ()
+        weights = (f"{path.name}.data", f"{path.name}_data")
+        beside = (*weights, *BESIDE) if wanted.kind in FILE_KINDS else ()
         files += filter(Path.is_file, map(path.with_name, beside))
     return files
 

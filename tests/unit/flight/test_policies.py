@@ -140,9 +140,17 @@ def test_what_is_read_beside_one_file_belongs_to_it(
         raise PermissionError
 
     monkeypatch.setattr(Path, "iterdir", unlisted)  # a folder that may only be entered
-    names = ("a.onnx", "a.onnx.data", "a.pt", "a.pt.data", "policy.json", "mavbridge.toml")
-    for name in (*names, "b.onnx", "b.onnx.data", "b.pt"):
+    weights = [f"a.{kind}{end}" for kind in ("onnx", "pt") for end in ("", ".data", "_data")]
+    for name in (*weights, "policy.json", "mavbridge.toml", "b.onnx", "b.onnx.data", "b.pt"):
         (tmp_path / name).write_text("")
     one = policy.partition("/")[2]
     found = [path.name for path in policy_files(PolicyConfig(policy=policy.format(tmp_path)))]
-    assert found == [one, f"{one}.data", "mavbridge.toml", "policy.json"]
+    assert found == [one, f"{one}.data", f"{one}_data", "mavbridge.toml", "policy.json"]
+
+
+def test_a_folder_of_graphs_is_known_by_their_weights_too(tmp_path: Path) -> None:
+    names = ["head.onnx", "head.onnx.data", "head.onnx_data"]
+    for name in (*names, "notes.txt"):
+        (tmp_path / name).write_text("")
+    found = policy_files(PolicyConfig(policy=f"onnx:{tmp_path}"))
+    assert [path.name for path in found] == names
