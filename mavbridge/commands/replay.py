@@ -84,9 +84,9 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     compared: PolicyComparison | None = None
     if chosen != "chunks":
         clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
-        with load_configured_policy(wanted.policy, clock) as loaded:
-            runner = loaded.runner
-            engine = runner.engine
+        in_air = wanted.takeoff is not None
+        with load_configured_policy(wanted.policy, clock, starts_in_air=in_air) as loaded:
+            runner, engine = loaded.runner, loaded.runner.engine
             plan = plan_flight(wanted, runner.contract, is_dual=runner.dual_rate)
             pairs = _replayed(flown, runner, clock, chosen)
         compared = compare_policy(pairs)

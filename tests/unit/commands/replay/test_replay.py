@@ -212,6 +212,16 @@ class Counting:
         return np.full((1, 8, 4), 0.01 * self._calls % 0.3, np.float32)
 
 
+def test_a_scripted_policy_begins_where_the_takeoff_ended(tmp_path: Path) -> None:
+    """With --takeoff it need not be said in its name, as it is in this flight's."""
+    folder = copied("scripted_velocity_ardupilot", tmp_path)
+    text = (folder / SETTINGS).read_text()
+    (folder / SETTINGS).write_text(
+        text.replace("scripted:square:velocity:air", "scripted:square:velocity")
+    )
+    assert replay(folder, ReplayConfig()) == ExitCode.DONE
+
+
 def test_a_memory_that_is_not_repeated_is_told_with_the_verdict(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
