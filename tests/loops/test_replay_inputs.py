@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
-from helpers.output_flights import OutputFlight
+from helpers.output_flights import HOVERING, OutputFlight
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
+from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.guard.values import Phase
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation import flight as simulation
@@ -27,7 +29,7 @@ from mavbridge.simulation.replay.compare import (
     compare_guard,
     compare_policy,
 )
-from mavbridge.simulation.replay.guard import replay_guard
+from mavbridge.simulation.replay.guard import recorded_plan, replay_guard, replay_other
 from mavbridge.simulation.replay.policy import replay_policy
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from mavbridge.simulation.world import make_vehicle
@@ -250,11 +252,36 @@ def test_the_guard_is_repeated_to_the_end_of_a_flight(
     flight.fly(0.2)
     end(flight)
     flight.run(0.5)
+    source = recorded(flight)
+    assert source.ticks[-1].phase != "flying"
+    assert compare_guard(replay_guard(source)).differ == {}
+
+
+@pytest.mark.parametrize("action", ["sticks", "velocity"])
+def test_a_mode_that_is_entered_before_the_slot_after_its_request_is_no_takeover(
+    action: ActionKind,
+) -> None:
+    flight = OutputFlight("px4", action, HOVERING, arm=True, takeoff=1.0)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=30)
+    flight.run(0.2)
+    source = recorded(flight, arm=True, takeoff=1.0)
+    steps = replay_guard(source)
+    assert compare_guard(steps).differ == {}
+    chunks = {
+        solve.serial: chunk_of(solve, action_frame(source.contract)) for solve in source.solves
+    }
+    ticks = replay_other(steps, recorded_plan(source).guard, chunks)
+    assert [tick.phase.value for tick in ticks] == [tick.phase for tick in source.ticks]
+
+
+def recorded(flight: OutputFlight, **config: Any) -> ReplaySource:
     requests = [m for _, m in flight.left() if m.get_type() == "PARAM_REQUEST_READ"]
-    source = ReplaySource(
+    return ReplaySource(
         folder=Path("in memory"),
-        meta=make_meta(contract=flight.scripted.contract, autopilot=autopilot),
-        config=FlyConfig(link=LinkConfig(connect="memory")),
+        meta=make_meta(
+            contract=flight.scripted.contract, autopilot="px4" if flight.is_px4 else "ardupilot"
+        ),
+        config=FlyConfig(link=LinkConfig(connect="memory"), **config),
         ticks=tuple(flight.sink.ticks),
         solves=tuple(flight.solves),
         features=((),),
@@ -262,5 +289,3 @@ def test_the_guard_is_repeated_to_the_end_of_a_flight(
         known_params=frozenset(m.param_id for m in requests),
         gaps=(),
     )
-    assert source.ticks[-1].phase != "flying"
-    assert compare_guard(replay_guard(source)).differ == {}

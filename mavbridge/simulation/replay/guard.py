@@ -65,6 +65,9 @@ class GuardStep:
     stop: EndRequest | None
     told: tuple[tuple[int, Reason], ...]
     """When and why the guard was told, since the step before, that there is no usable chunk."""
+    passes: tuple[tuple[int, LinkSnapshot], ...]
+    """Passes since the step before, on the way into a flight: such a pass has no tick, but it may
+    ask the vehicle, whose answer comes before the next slot."""
 
 
 def unrepeatable(ticks: Sequence[Tick]) -> Iterator[str]:
@@ -110,6 +113,12 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
                 port.inbox.append(encode_to_guard(absence))
                 loop.step()
                 absence = None
+        passes: list[tuple[int, LinkSnapshot]] = []
+        if steps and steps[-1].recorded.phase == tick.phase == Phase.PREPARING.value:
+            until_ns = min(tick.woke_ns, tick.due_ns)
+            for _ in _arrived(link, clock, transport, until_ns):
+                loop.step()
+                passes.append((clock.now_ns(), link.newest))
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = at_ns, tick.sent_ns
         is_neutral_refused = source.meta.keeps_neutral and tick.lacks_neutral
@@ -128,6 +137,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
                 act=act,
                 stop=stop,
                 told=tuple(told),
+                passes=tuple(passes),
             )
         )
     return steps
@@ -136,7 +146,16 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
 def _keep_link(
     link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
 ) -> None:
-    """Let the link receive and request between two ticks: at each arrival, or soon.
+    """Let the link receive and request between two ticks."""
+    for _ in _arrived(link, clock, transport, until_ns):
+        link.receive()
+        link.service()
+
+
+def _arrived(
+    link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
+) -> Iterator[None]:
+    """Advance the clock to ``until_ns``; yield at each arrival before, or soon.
 
     It also services the link just before each arrival, since the packet may be the answer to a
     request: a vehicle selected a moment later would still be ignored.
@@ -149,8 +168,7 @@ def _keep_link(
                 link.service()
         clock.sleep_until_ns(min(arrival_ns, clock.now_ns() + PREPARE_NS, until_ns))
         if clock.now_ns() < until_ns:
-            link.receive()
-            link.service()
+            yield
 
 
 def replay_other(
@@ -170,6 +188,8 @@ def replay_other(
         chunk = None if step.chunk_serial is None else chunks.get(step.chunk_serial)
         at_ns = step.recorded.decided_ns or step.recorded.woke_ns
         absence: Reason | None = None
+        for passed_ns, snapshot in step.passes:
+            guard.step(passed_ns, GuardInput(link=snapshot))
         for told_ns, reason in step.told:
             if told_ns < step.recorded.due_ns:
                 guard.step(told_ns, GuardInput(link=step.snapshot, absence=reason))
