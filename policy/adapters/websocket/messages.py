@@ -65,7 +65,8 @@ def unpack(data: bytes | str) -> Message:
     try:
         message = msgpack.unpackb(data, object_hook=_unpack_numpy, strict_map_key=False)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
-        raise MessageError(f"not a msgpack map of openpi's protocol: {error}") from error
+        why = str(error) or type(error).__name__
+        raise MessageError(f"not a msgpack map of openpi's protocol: {why}") from error
     if not isinstance(message, dict):
         raise MessageError(f"a msgpack {type(message).__name__} in place of a map")
     return {_text(key): value for key, value in message.items()}
