@@ -117,10 +117,7 @@ class EchoCheck:
         return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
     def with_dither(self, wanted: Shown, now_ns: int) -> Shown:
-        """Return the values to send, one of them dithered by up to two steps towards the centre.
-
-        The echo of a vehicle that hears us then keeps changing, unlike another source at rest.
-        """
+        """Return the values to send, one dithered by up to two steps, so that its echo changes."""
         rules, at = self._rules, self._rules.dithered
         step = rules.dither if self.confirmed else rules.seek_dither
         dither = now_ns // DITHER_STEP_NS % _DITHER_LEVELS * step
@@ -153,10 +150,7 @@ class EchoCheck:
         self._forget_shown()
 
     def received(self, values: Shown, shown_us: int, now_ns: int) -> None:
-        """Compare the values of one message with the vehicle's timestamp ``shown_us``.
-
-        Late and duplicate datagrams are skipped.
-        """
+        """Compare the values of a message stamped ``shown_us`` by the vehicle; skip late ones."""
         newest_us = self._order.newest_us
         if not self._order.accepts(shown_us):
             return

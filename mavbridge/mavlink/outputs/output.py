@@ -56,11 +56,7 @@ class ActionOutput(ABC):
 
     @abstractmethod
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """Encode an action; return None if the vehicle is not ready for it.
-
-        Raises:
-            CommandRefusedError: the action must not be sent.
-        """
+        """Encode an action; None before the vehicle is ready, CommandRefusedError if refused."""
 
     def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note an action that was sent."""

@@ -16,9 +16,8 @@ from mavbridge.core.vehicle import (
     Release,
 )
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.outputs.attitude import AttitudeOutput
 from mavbridge.mavlink.outputs.output import ActionOutput
-from mavbridge.mavlink.outputs.setpoints import VelocityOutput
+from mavbridge.mavlink.outputs.setpoints import AttitudeOutput, VelocityOutput
 from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -38,11 +37,7 @@ CARRIED: dict[Output, ActionKind] = {
 def choose_output(
     meaning: ActionMeaning, wanted: Output | None, profile: Profile, codec: Codec
 ) -> ActionOutput:
-    """Return the requested output, or the default of these actions and this vehicle.
-
-    Raises:
-        PeerError: the output does not fit the vehicle or the actions.
-    """
+    """Return the output asked for, or the default; raise PeerError if it does not fit."""
     usual = profile.usual_output(meaning.kind)
     name = wanted or usual
     if CARRIED[name] != meaning.kind:
@@ -64,10 +59,7 @@ def choose_output(
 
 
 class ActionSender:
-    """Sends actions through the flight's output, once vehicle and policy are known.
-
-    A release that could not be sent goes before every other packet.
-    """
+    """Sends actions through the flight's output; a release that failed goes before all packets."""
 
     def __init__(self, connection: Connection, codec: Codec, clock: Clock) -> None:
         self._connection, self._codec, self._clock = connection, codec, clock
@@ -82,11 +74,7 @@ class ActionSender:
         """None until vehicle and policy are known."""
 
     def begin_flight(self, meaning: ActionMeaning, wanted: Output | None) -> None:
-        """Choose the output for these actions, now or once the vehicle is known.
-
-        Raises:
-            PeerError: the vehicle cannot be flown with it.
-        """
+        """Choose the output, now or once the vehicle is known; raise PeerError if it cannot be."""
         self._flight, self.output = (meaning, wanted), None
         if self._vehicle is not None:
             self.equip(self._vehicle)

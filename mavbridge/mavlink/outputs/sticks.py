@@ -16,12 +16,7 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import STICK_END, Body, ManualControl, RcChannels
-from mavbridge.mavlink.codec.packets import (
-    Codec,
-    CommandRefusedError,
-    manual_control_of,
-    pwm_of,
-)
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError, manual_control_of, pwm_of
 from mavbridge.mavlink.outputs.echo import EchoRules, Shown
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
@@ -61,12 +56,11 @@ class StickOutput(ActionOutput):
         curves = self._curves_of(vehicle, status.mode, now_ns)
         if curves.is_identity or (status.rc_sticks is None and status.pilot_sticks is None):
             return status
-        rc, pilot = status.rc_sticks, status.pilot_sticks
-        return replace(
-            status,
-            rc_sticks=None if rc is None else curves.to_policy(rc),
-            pilot_sticks=None if pilot is None else curves.to_policy(pilot),
+        rc, pilot = (
+            None if sticks is None else curves.to_policy(sticks)
+            for sticks in (status.rc_sticks, status.pilot_sticks)
         )
+        return replace(status, rc_sticks=rc, pilot_sticks=pilot)
 
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
@@ -192,10 +186,7 @@ _REST_SHARE = 0.5
 
 
 class ManualControlOutput(StickOutput):
-    """MANUAL_CONTROL, whose release is silence after one neutral packet.
-
-    PX4 takes the silence for lost sticks if it received only ours.
-    """
+    """MANUAL_CONTROL, whose release is one neutral packet, then silence: lost sticks to PX4."""
 
     name: Output = "manual-control"
     releases = 1
@@ -267,17 +258,15 @@ class ManualControlOutput(StickOutput):
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Encode one level packet in modes flown by sticks, with the last throttle in thrust modes.
 
-        Without this packet the vehicle would fly on with the policy's last sticks for
-        COM_RC_LOSS_T, also with a receiver. After a session restart the last known status counts:
-        a reboot may be only a wrong timestamp.
+        Without it the vehicle would fly on with the policy's last sticks for COM_RC_LOSS_T. After a
+        session restart the last known status counts: a reboot may be only a wrong timestamp.
         """
         status = vehicle.status(now_ns) or self._status
         if status is None or status.mode not in _MODES:
             return None
         z = self._last[2] if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
-        return self._codec.encode_manual_control(
-            vehicle.identity.source.system, ManualControl(0, 0, z, 0)
-        )
+        level = ManualControl(0, 0, z, 0)
+        return self._codec.encode_manual_control(vehicle.identity.source.system, level)
 
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
         """True if the vehicle shows other sticks, or none any more."""

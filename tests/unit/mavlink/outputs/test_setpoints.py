@@ -19,8 +19,12 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.mavlink.codec.messages import Attitude, AttitudeTarget, SpecificForce, VelocityTarget
 from mavbridge.mavlink.codec.packets import CommandRefusedError
-from mavbridge.mavlink.outputs.attitude import MOST_LEAD_RAD, AttitudeOutput
-from mavbridge.mavlink.outputs.setpoints import HELD_NS, VelocityOutput
+from mavbridge.mavlink.outputs.setpoints import (
+    HELD_NS,
+    MOST_LEAD_RAD,
+    AttitudeOutput,
+    VelocityOutput,
+)
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.profiles.px4 import PX4
