@@ -10,7 +10,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.profiles.profile import ParamNote, Profile
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from mavbridge.mavlink.session.params.checks import Assessment
+from mavbridge.mavlink.session.params.vehicle_params import Assessment
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 

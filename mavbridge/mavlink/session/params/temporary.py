@@ -34,10 +34,7 @@ class _Write:
 
 
 class TemporaryParams:
-    """Sets the wanted parameters of a disarmed vehicle, and restores the old values.
-
-    A killed flight leaves them set; the log has the old values.
-    """
+    """Sets parameters of a disarmed vehicle for a flight, and restores the old values after it."""
 
     def __init__(
         self,
@@ -140,10 +137,7 @@ class TemporaryParams:
                 del self._before[name]
 
     def restore(self) -> bool:
-        """Restore all changed parameters in the next steps.
-
-        Return True if everything is restored, or nothing more can be done now.
-        """
+        """Restore changed parameters in the next steps; True if nothing more can be done now."""
         self._is_ending = True
         return not self._before or (self._is_restoring and self.is_settled)
 

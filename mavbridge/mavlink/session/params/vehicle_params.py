@@ -1,13 +1,18 @@
 """Parameters of one vehicle: known values, demands of the flight, and changes for it."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.frames import SIGNATURE_BYTES
 from mavbridge.mavlink.codec.messages import (
     CommandRequest,
     ParamAbsent,
@@ -15,9 +20,92 @@ from mavbridge.mavlink.codec.messages import (
     ParamValue,
     ParamWrite,
 )
-from mavbridge.mavlink.profiles.profile import ParamContext, Profile, StreamGroup
-from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_risks
+from mavbridge.mavlink.codec.readers import IDS
+from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
+
+_FRAME_BYTES = 12
+"""Header and checksum of MAVLink 2."""
+_OVERRIDE_BYTES = 30
+"""RC_CHANNELS_OVERRIDE of eight channels; MANUAL_CONTROL is shorter."""
+_OTHERS_BYTES_PER_S = 500
+"""Heartbeats, TIMESYNC and requests, per direction."""
+_BITS_PER_BYTE = 10
+"""One start bit, eight data bits, one stop bit."""
+_STANDARD_BAUDS = (57600, 115200, 230400, 460800, 921600, 1500000, 3000000)
+
+
+class Assessment(NamedTuple):
+    """Result of checking one set of parameters."""
+
+    context: ParamContext
+    calibration: RcCalibration | None
+    unusable: str | None
+    """Why a calibration that the output needs is missing; None: it is not."""
+    override_switch: int | None
+    """Number of the channel that enables the output."""
+    notes: tuple[ParamNote, ...]
+    """All notes; those of kind risk are not accepted."""
+
+    @property
+    def obstacles(self) -> tuple[ParamNote, ...]:
+        """Reasons why the vehicle would not follow our commands."""
+        return tuple(note for note in self.notes if note.kind == "obstacle")
+
+    @property
+    def risks(self) -> tuple[ParamNote, ...]:
+        """Risks that the user has not accepted."""
+        return tuple(note for note in self.notes if note.kind == "risk")
+
+    def endangers(self, before: "Assessment") -> bool:
+        """True if these parameters must end a flight that began with ``before``."""
+        return (
+            self.calibration != before.calibration
+            or self.override_switch != before.override_switch
+            or not {each.names for each in self.obstacles}
+            <= {each.names for each in before.obstacles}
+            or not {each.risk for each in self.risks} <= {each.risk for each in before.risks}
+        )
+
+
+def assess(profile: Profile, values: Mapping[str, float], context: ParamContext) -> Assessment:
+    """Check the parameters of a vehicle of this firmware."""
+    is_override = context.output == "rc-override"
+    ours: RcCalibration | None = None
+    unusable: str | None = None
+    try:
+        ours = profile.calibration(values)
+    except ValueError as error:
+        unusable = str(error) if is_override else None
+    switch = profile.traits(values).override_switch if is_override else None
+    all_notes, accepted = (*context.serial, *profile.notes(values, context)), context.accepted_risks
+    notes = tuple(note.accepted() if note.risk in accepted else note for note in all_notes)
+    return Assessment(context, ours, unusable, switch, notes)
+
+
+def received_bytes_per_s(streams: Iterable[StreamGroup], frame_bytes: int = _FRAME_BYTES) -> float:
+    """Return the bandwidth of these streams with full-length messages, rare ones excluded."""
+    steady = [(stream.rate_hz, stream.messages[0]) for stream in streams if stream.least_hz is None]
+    streamed: float = sum(
+        rate_hz * (frame_bytes + dialect.mavlink_map[IDS[name]].unpacker.size)
+        for rate_hz, name in steady
+    )
+    return _OTHERS_BYTES_PER_S + streamed
+
+
+def serial_risks(settings: LinkSettings, streams: Iterable[StreamGroup]) -> tuple[ParamNote, ...]:
+    """Return the risk of too low a baud rate: the fuller direction of the serial port decides."""
+    baud = serial_baud(settings.connect)
+    signature_bytes = 0 if settings.signing is None else SIGNATURE_BYTES
+    sent_bytes_per_s = _OTHERS_BYTES_PER_S + settings.stick_hz * (_OVERRIDE_BYTES + signature_bytes)
+    received = received_bytes_per_s(streams, _FRAME_BYTES + signature_bytes)
+    needed = max(received, sent_bytes_per_s) * _BITS_PER_BYTE
+    if baud is None or baud >= needed:
+        return ()
+    enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), needed)
+    why = because(Code.SLOW_SERIAL, baud=baud, needed=needed, enough=enough)
+    return (ParamNote.of_risk("slow-serial", why),)
+
 
 _WINDOW = 16
 """Requests in flight at once; ArduPilot queues twenty."""
@@ -123,9 +211,7 @@ class VehicleParams:
         before, self._assessed = self._assessed, None
         after = self._current(status)
         is_armed = status is not None and status.armed
-        if not is_armed or old is None or before is None:
-            return
-        if after.endangers(before):
+        if is_armed and old is not None and before is not None and after.endangers(before):
             self.interruption = because(
                 Code.PARAMETER_CHANGED, name=param.name, before=old, after=param.value
             )
@@ -197,13 +283,12 @@ class VehicleParams:
         """Adopt the calibration that was read, at the start or when next disarmed."""
         self.is_read = True
         assessment = self._current(status)
-        if assessment.calibration == self.calibration:
-            return
+        before, now = self.calibration, assessment.calibration
         is_armed = status is not None and status.armed
-        if self.calibration is None or not is_armed:
-            if self.calibration is not None and assessment.calibration is not None:
+        if before is None or (before != now and not is_armed):
+            if before is not None and now is not None:
                 self._report("the vehicle's radio calibration has changed: the new one counts")
-            self.calibration = assessment.calibration
+            self.calibration = now
 
     def _advise(self, status: VehicleStatus | None) -> None:
         assessment = self._current(status)
@@ -223,17 +308,11 @@ class VehicleParams:
             return None
         assessment = self._current(status)
         if assessment.obstacles:
-            is_sticks = output in ("rc-override", "manual-control")
-            what = (
-                "ignore our sticks, or take them otherwise"
-                if is_sticks
-                else "not fly by our setpoints"
-            )
-            return because(
-                Code.OBSTACLE,
-                what=what,
-                causes="; ".join(each.text for each in assessment.obstacles),
-            )
+            what = "not fly by our setpoints"
+            if output in ("rc-override", "manual-control"):
+                what = "ignore our sticks, or take them otherwise"
+            causes = "; ".join(each.text for each in assessment.obstacles)
+            return because(Code.OBSTACLE, what=what, causes=causes)
         if assessment.unusable is not None:
             return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
         if output == "rc-override" and assessment.calibration != self.calibration:
