@@ -29,7 +29,6 @@ from mavbridge.flight.policies import check_configured_policy, load_configured_p
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.terminal import MessageScreen
 from policy.adapters.interface import Interface
-from policy.adapters.websocket.link import API_KEY_VARIABLE
 from policy.adapters.websocket.messages import (
     CONTRACT_KEY,
     RESET_KEY,
@@ -38,7 +37,7 @@ from policy.adapters.websocket.messages import (
     pack,
     unpack,
 )
-from policy.adapters.websocket.remote_policy import ACTIONS_KEY
+from policy.adapters.websocket.remote_policy import ACTIONS_KEY, API_KEY_VARIABLE
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner, keep_nothing
 

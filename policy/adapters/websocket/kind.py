@@ -22,7 +22,7 @@ SCHEMES = ("ws", "wss")
 PACKAGES = ("msgpack", "websockets")
 """Packages of the extra ``remote``."""
 
-TERMS = ("play_s", "modes", *LIMIT_TERMS)
+TERMS = {"play_s", "modes", *LIMIT_TERMS}
 """Contract fields of mavbridge's own server that a contract file may replace: flight terms."""
 
 
@@ -48,9 +48,8 @@ def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) 
 
 def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
     """Connect to a policy server, find its contract and try it; return lines for the user too."""
-    from policy.adapters.websocket.link import API_KEY_VARIABLE, ServerLink
     from policy.adapters.websocket.messages import CONTRACT_KEY
-    from policy.adapters.websocket.remote_policy import RemotePolicy
+    from policy.adapters.websocket.remote_policy import API_KEY_VARIABLE, RemotePolicy, ServerLink
 
     link = ServerLink(url, api_key=os.environ.get(API_KEY_VARIABLE))
     try:
@@ -97,17 +96,13 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
             f"--contract {contract_file}: leave out [{'], ['.join(file)}]: the server announces "
             "its contract, and converts state, actions and images itself"
         )
-    kept = {
-        field.name: getattr(contract, field.name)
-        for field in fields(Contract)
-        if field.init and not (field.name in TERMS and field.name in said)
-    }
-    return read_interface(contract_file, kept)
+    freed = said.keys() & TERMS
+    names = [field.name for field in fields(Contract) if field.init and field.name not in freed]
+    return read_interface(contract_file, {name: getattr(contract, name) for name in names})
 
 
 def _json_text(metadata: "Message", key: str) -> str | None:
     """Return a JSON text of the server's metadata; None if it is not there."""
-    text = metadata.get(key)
-    if text is None or isinstance(text, str):
+    if isinstance(text := metadata.get(key), str | None):
         return text
     raise ContractError(f"the server's {key} must be JSON as text, got a {type(text).__name__}")

@@ -77,15 +77,11 @@ def _text(value: object) -> str:
 
 
 def _pack_numpy(value: object) -> object:
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        return {
-            ARRAY.encode(): True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": value.shape,
-        }
-    if isinstance(value, np.generic) and value.dtype.kind in "biuf":
-        return {NUMBER.encode(): True, b"data": value.item(), b"dtype": value.dtype.str}
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
+        kind = {b"dtype": value.dtype.str}
+        if isinstance(value, np.generic):
+            return {NUMBER.encode(): True, b"data": value.item(), **kind}
+        return {ARRAY.encode(): True, b"data": value.tobytes(), **kind, b"shape": value.shape}
     raise TypeError(f"a {type(value).__name__} cannot be sent to a policy server")
 
 
@@ -141,10 +137,7 @@ def to_message(
     is_ours: bool,
     delay_s: float,
 ) -> Message:
-    """Return the request for one observation: arrays of ``predict``, without the batch.
-
-    ``is_ours``: for mavbridge's own server, which takes the history.
-    """
+    """Return one observation's request, without the batch; ``is_ours``: with the history."""
     contract = interface.contract
     images = image[..., 0, :, :] if contract.is_depth else to_uint8(image, contract)
     # [N, H, W, 3] and [T, N, H, W, 3] only with several cameras
@@ -201,10 +194,7 @@ def _array(
 
 
 def to_uint8(planes: FloatArray, contract: Contract) -> NDArray[np.uint8]:
-    """Convert normalised images [..., 3, H, W] back to their uint8 source [..., H, W, 3], exactly.
-
-    float32 keeps the 256 levels far apart: the error before rounding is below 0.001.
-    """
+    """Convert normalised images [..., 3, H, W] back to uint8 [..., H, W, 3], exactly."""
     levels = input_to_bytes(planes, contract).astype(np.uint8)
     return np.ascontiguousarray(np.moveaxis(levels, -3, -1))
 
