@@ -20,11 +20,9 @@ MAX_HEADER_BYTES = 100_000_000
 LEROBOT_TYPES = ("act", "diffusion")
 """Types of LeRobot policies that fly from their files."""
 _FOLDERS: tuple[tuple[str, str, str], ...] = (
-    ("pretrained_model/", "a folder of LeRobot's training", "fly it with --policy lerobot:{0}/{1}"),
-    (
-        "checkpoints/last/pretrained_model/",
-        "a folder of LeRobot's training",
-        "fly it with --policy lerobot:{0}/{1}",
+    *(
+        (sign, "a folder of LeRobot's training", "fly it with --policy lerobot:{0}/{1}")
+        for sign in ("pretrained_model/", "checkpoints/last/pretrained_model/")
     ),
     ("meta/info.json", "a LeRobot data set, not a policy", "train one: mavbridge train {0}"),
     ("ticks.parquet", "a recorded flight, not a policy", "train one: mavbridge train {0}"),

@@ -68,7 +68,7 @@ WORLD_MODEL_KEY = "world_model"
 
 
 def save_checkpoint(
-    path: Path, policy: BuiltinPolicy, *, training: str | None = None, packed: bool = False
+    path: Path, policy: BuiltinPolicy, *, training: str = "{}", packed: bool = False
 ) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` atomically.
 
@@ -85,9 +85,8 @@ def save_checkpoint(
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
     architecture = config_json(policy.config, policy=policy.config.kind)
-    header = {CONTRACT_KEY: policy.contract.to_json(), ARCHITECTURE_KEY: architecture}
-    if training is not None:
-        header[TRAINING_KEY] = training
+    contract = policy.contract.to_json()
+    header = {CONTRACT_KEY: contract, ARCHITECTURE_KEY: architecture, TRAINING_KEY: training}
     write_tensors(path, state, header)
 
 
@@ -103,11 +102,8 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
         header, tensors = read_tensors(path)
         require_header(path, header)
         config = _config_of(path, header, ARCHITECTURE_KEY, type(fallback))
-        vector = {
-            name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
-            for name in list(tensors)
-            if name.startswith(VECTOR_PREFIX)
-        }
+        ours = [name for name in tensors if name.startswith(VECTOR_PREFIX)]
+        vector = {name.removeprefix(VECTOR_PREFIX): tensors.pop(name) for name in ours}
         state = unpack(tensors)
     else:
         state = _read_torch(path)
@@ -218,19 +214,14 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
     return find_weights(path, loaded)
 
 
-def save_world_model(path: Path, model: WorldModel, *, training: str | None = None) -> None:
-    """Write weights, in float16, and configuration; replaces ``path`` atomically.
-
-    ``training`` is JSON about the training, for people and reports.
-    """
+def save_world_model(path: Path, model: WorldModel, *, training: str = "{}") -> None:
+    """Write float16 weights and configuration, atomically; ``training``: JSON for people."""
     state = {
         name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()
     }
     require_finite(path, state)
-    config = model.config
-    header = {WORLD_MODEL_KEY: config_json(config), CONTRACT_KEY: config.contract.to_json()}
-    if training is not None:
-        header[TRAINING_KEY] = training
+    config, contract = config_json(model.config), model.config.contract.to_json()
+    header = {WORLD_MODEL_KEY: config, CONTRACT_KEY: contract, TRAINING_KEY: training}
     write_tensors(path, state, header)
 
 
@@ -243,6 +234,5 @@ def load_world_model(path: Path) -> WorldModel:
         raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
     config = _config_of(path, header, WORLD_MODEL_KEY, WorldModelConfig)
     return load_fitting(
-        *(path, partial(WorldModel, config), state),
-        "Train it again with this version of mavbridge",
+        *(path, partial(WorldModel, config), state), "Train it again with this version of mavbridge"
     )

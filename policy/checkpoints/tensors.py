@@ -89,10 +89,7 @@ class _Budget(TorchFunctionMode):
 def load_fitting(
     path: Path, build: Callable[[], Net], state: Mapping[str, Tensor], advice: str
 ) -> Net:
-    """Build a network and load its weights; return it in eval mode.
-
-    Batch counts may be missing: only training uses them.
-    """
+    """Build a network, load its weights, return it in eval mode; batch counts may be missing."""
     try:
         with _Budget(state, advice):
             net = build()
