@@ -99,13 +99,12 @@ def _trained(
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}"]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
-        notes.append(
-            warned(
-                f"{checkpoint} holds no contract; it is flown with frame "
-                f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
-                f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-                f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-                f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
-            )
+        told = (
+            f"{checkpoint} holds no contract; it is flown with frame {contract.state_frame}, "
+            f"image {contract.image_width}x{contract.image_height}, "
+            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
         )
+        notes.append(warned(told))
     return policy, notes

@@ -67,10 +67,7 @@ def check_request(request: PolicyRequest) -> Contract | None:
 
 @contextmanager
 def _folder_kept() -> Iterator[None]:
-    """Context manager: return to the working directory if a policy's code has left it.
-
-    Output files are relative to it.
-    """
+    """Context manager: return to the working directory, which output files are relative to."""
     with ExitStack() as stack:
         with suppress(OSError):  # it was deleted, or is closed to this user
             stack.enter_context(chdir(Path.cwd()))
@@ -93,10 +90,7 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
 
 @_folder_kept()
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
-    """Find, build, load, try and time a policy.
-
-    ``now_s`` (monotonic seconds) times the policy and drives scripted programs.
-    """
+    """Find, load, try and time a policy; ``now_s`` (monotonic seconds) also drives programs."""
     check_request(request)
     policy, notes, make_runner = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
@@ -122,13 +116,9 @@ def _settings(
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
-        notes.append(
-            warned(
-                f"{request.spec} has no fast path (encode_visual and predict_fast), so it "
-                "flies in single-rate mode, the whole network for every action (--single-rate: as "
-                "intended)"
-            )
-        )
+        lack = f"{request.spec} has no fast path (encode_visual and predict_fast)"
+        effect = "it flies in single-rate mode, the whole network for every action"
+        notes.append(warned(f"{lack}, so {effect} (--single-rate: as intended)"))
     return ExecutionSettings(
         name=request.spec,
         device=request.device,

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 from policy.contract import Contract
 from policy.engines.runner import EngineName, dummy_sample, encode_all
@@ -15,8 +16,7 @@ MOST_S = 0.5
 """Stop repeating after this time: one run is enough to know that a policy is slow."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SolveTimes:
+class SolveTimes(NamedTuple):
     """Median times by the injected clock; zero if that clock stands still."""
 
     encode_s: float
@@ -26,10 +26,7 @@ class SolveTimes:
 
 
 def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTimes | None:
-    """Time a policy that was tried before; return None if it had no chunk for the dummy sample.
-
-    If the clock stands still, as in simulations, each call runs only once.
-    """
+    """Time a policy, by single calls if the clock stands still; None if it had no chunk."""
     contract = runner.contract
     images, state, history = dummy_sample(contract)
     encode_s: list[float] = []
