@@ -4,8 +4,8 @@ python -m benchmarks.train_shipped toge --out training
 
 Both start from the weights shipped before, taken from this repository's history. toge: in three
 rounds they fly, the expert corrects them, and they learn from that. toge-rates learns the end of a
-flight alone, in two rounds. What shipped was made a little differently (policy/weights/README.md),
-and neither recipe has been run as a whole.
+flight alone, in two rounds, and then other looks (teach_looks.py). What shipped was made a little
+differently (policy/weights/README.md), and neither recipe has been run as a whole.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
 kept, and an unfinished training begins again. Seeds determine the flights. Training budgets are
@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 
 from cyclopts import App
 
+from benchmarks import teach_looks
 from mavbridge.commands.output import table_console
 
 app = App(help=__doc__)
@@ -31,6 +32,7 @@ NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, LOOPS, PX4 = "--action rates --courses race", "--courses loop", "--autopilot px4"
 STICKS, END = "--include-failed --ages 10:220", "--include-failed --ages 10:140 --only-end"
 
+LOOK_MINUTES = 120
 BEFORE = "438fb84af6f14453cf773d90c24cdd1e15b7b50a"
 """Commit of 2026-11-27 with the weights to start from."""
 
@@ -97,9 +99,9 @@ STEPS: dict[str, tuple[Step, ...]] = {
             "stopping_px", f"--episodes 10 --seed 79 --speed 9 --max-time 60 {RACES} {PX4}", "first"
         ),
         training(
-            "toge-rates",
+            "stops",
             "races loops px own_races own_loops own_px stopping stopping_px",
-            f"--minutes 9 {END} --pack",
+            f"--minutes 9 {END}",
             start="before",
         ),
     ),
@@ -124,6 +126,9 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
         elif not (folder / step.makes).exists():
             run(folder, f"{step.command} --out partial.safetensors")
             (folder / "partial.safetensors").replace(folder / step.makes)
+    before, taught = folder / "stops.safetensors", folder / "toge-rates.safetensors"
+    if policy == "toge-rates" and not taught.exists():
+        teach_looks.main(before, out=taught, minutes=LOOK_MINUTES)
 
 
 def copy_weights_before(policy: str, path: Path) -> None:

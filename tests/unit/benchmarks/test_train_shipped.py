@@ -21,6 +21,12 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(train_shipped, "run", remember)
     monkeypatch.setattr(train_shipped, "copy_weights_before", lambda _, path: path.touch())
+
+    def teach(before: Path, *, out: Path, minutes: float) -> None:
+        assert before.exists()
+        out.touch()
+
+    monkeypatch.setattr(train_shipped.teach_looks, "main", teach)
     return run
 
 
@@ -30,6 +36,7 @@ def test_every_command_is_one_of_ours(
 ) -> None:
     train_shipped.main(policy, out=tmp_path)  # type: ignore[arg-type]
     assert len(commands) == len(STEPS[policy])
+    assert (tmp_path / policy / f"{policy}.safetensors").exists()
     monkeypatch.chdir(tmp_path / policy)
     for command in commands:
         _, outer, _ = cli.meta.parse_args(command.split(), print_error=False, exit_on_error=False)
