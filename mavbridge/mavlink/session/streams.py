@@ -12,6 +12,9 @@ from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
+_PAUSE_NS = 10 * NS_PER_S
+"""Time between two requests for an optional message that the vehicle has left unanswered, so that a
+slow link is not loaded for ever. The first pauses are shorter: a gap of the link looks alike."""
 _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
 _UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
@@ -39,7 +42,9 @@ class _Stream:
         """True if it had been when the counting window began."""
         self.received: Counter[str] = Counter()
         """Messages by name: a vehicle may also send another one of the group unrequested."""
-        self.newest_ns = self.stand_in_due_ns = 0
+        self.newest_ns = self.stand_in_due_ns = self.due_ns = 0
+        self.silences = 0
+        """Times in a row that an optional group was given up without an answer."""
         self.is_absence_told = False
         self.want(group)
 
@@ -178,6 +183,7 @@ class StreamRequester:
             return
         if ack.result in _UNDECIDED:
             return  # repeated as if there were no answer
+        self._pending.silences = 0
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.settle()
         else:
@@ -190,13 +196,16 @@ class StreamRequester:
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
-            if self._pending.attempts >= _ATTEMPTS:
+            if self._pending.attempts >= (1 if self._pending.silences else _ATTEMPTS):
                 self._pending.refuse(is_silent=True)
                 if not self._pending.group.is_needed:  # the others first
+                    pause_ns = min(_WATCH_NS << self._pending.silences, _PAUSE_NS)
+                    self._pending.due_ns = now_ns + pause_ns
+                    self._pending.silences += 1
                     self._streams.remove(self._pending)
                     self._streams.append(self._pending)
         may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
-        open_streams = (s for s in self._streams if not s.is_settled)
+        open_streams = (s for s in self._streams if not s.is_settled and now_ns >= s.due_ns)
         self._pending = next((s for s in open_streams if may_repeat or not s.is_denied), None)
         if self._pending is None:
             return None

@@ -126,6 +126,8 @@ simulator clock, plus a margin."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
 """Most requests to a vehicle that answers those for parameters."""
+_VERSION_PAUSE_NS = 10 * NS_PER_S
+"""Time between two later requests to a vehicle that answers none at all."""
 
 
 class VehicleSession:
@@ -153,7 +155,8 @@ class VehicleSession:
         """Shows a text to the user."""
         self._texts = TextJoiner()
         self.version: str | None = None
-        self._version_attempts = 0
+        self._version_attempts = [0, 0]
+        """Requests before the vehicle answered one for a parameter, and since then."""
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
@@ -257,10 +260,12 @@ class VehicleSession:
     def step(self, now_ns: int) -> Iterator[Request]:
         """Yield the requests that are due."""
         self._show(*self._texts.step(now_ns))
-        is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
-        if is_version_open and now_ns >= self._version_due_ns:
-            self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
-            self._version_attempts += self.params.has_answered
+        asked, has_answered = self._version_attempts, self.params.has_answered
+        is_early = asked[has_answered] < _VERSION_ATTEMPTS
+        is_due = now_ns >= self._version_due_ns or asked[has_answered] == 0
+        if self.version is None and is_due and (is_early or not has_answered):
+            asked[has_answered] += 1
+            self._version_due_ns = now_ns + (_VERSION_TIMEOUT_NS if is_early else _VERSION_PAUSE_NS)
             number = float(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Parameters first: a vehicle slows its streams down while it sends parameters.

@@ -89,6 +89,20 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     assert requester.renewals == 0
 
 
+def test_what_no_answer_comes_to_is_asked_for_ever_more_rarely() -> None:
+    groups = PX4.streams(state_hz=100)
+    link = Link(groups, capacity_hz=1e4)
+    optional = [IDS[group.messages[0]] for group in groups if not group.is_needed]
+    link.silent = link.mute = set(optional)
+    link.run(60.0)
+    before = len(link.asked)
+    link.run(60.0)
+    assert len(link.asked) - before <= 6 * len(optional)  # each once in 10 s
+    link.silent, link.mute = set(), set()
+    link.run(11.0)
+    assert link.rates_hz.keys() >= set(optional)
+
+
 LEGACY = StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
 DENIED_ONCE = [(number, us) for number in (31, 30) for us in (10000, 20000, 40000)]
 
@@ -165,6 +179,8 @@ class Link:
         """Messages that the vehicle grants and does not send."""
         self.unanswered: set[int] = set()
         """Requests, counted from 1, whose answers are lost."""
+        self.mute: set[int] = set()
+        """Messages whose requests the vehicle neither grants nor answers."""
         self.stand_ins = 0
 
     def run(self, duration_s: float) -> None:
@@ -172,6 +188,8 @@ class Link:
             self._now_ns += NS_PER_MS
             if (request := self.requester.step(self._now_ns)) is not None:
                 self.asked.append((int(request.params[0]), 1e6 / request.params[1]))
+                if request.params[0] in self.mute:
+                    continue
                 self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
                 if len(self.asked) not in self.unanswered:
                     self.requester.receive_ack(ack(0))
