@@ -286,7 +286,7 @@ class Finding(NamedTuple):
     @property
     def line(self) -> Text:
         """Return the line of the terminal."""
-        return Text.assemble((f"{self.name:9}", "bold"), (self.text, self.style))
+        return Text.assemble((f"{self.name:8} ", "bold"), (self.text, self.style))
 
 
 def findings(report: TimingReport) -> list[Finding]:

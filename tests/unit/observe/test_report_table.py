@@ -8,7 +8,7 @@ from helpers.factories import START_NS, TICK_NS, make_released_tick, make_tick
 from helpers.reports import report_of
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import LinkStats
-from mavbridge.observe.terminal import findings, timing_table
+from mavbridge.observe.terminal import Finding, findings, timing_table
 from mavbridge.observe.timing import TimingReport
 
 
@@ -66,6 +66,10 @@ def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
         "the flight is over (0.0 s); the flight was ended by a signal (0.0 s)",
         "rerun    missed 1 event",
     ]
+
+
+def test_a_long_name_stays_apart_from_its_text() -> None:
+    assert Finding("recording", "cut off").line.plain == "recording cut off"
 
 
 @pytest.mark.parametrize(
