@@ -178,6 +178,8 @@ class TrainingRun(ABC, Generic[M, B]):
             if not stage.trains_encoder:
                 self._freeze_encoder()
             self._train(stage)
+        if self.step == 0:
+            raise TrainingError("the time was over before the first step: give more --minutes")
         self._validate(self.stages[-1])
         return TrainResult(checkpoint=self.settings.out, steps=self.step, validation=self._best)
 

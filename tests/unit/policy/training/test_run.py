@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -258,6 +259,13 @@ def test_a_budget_of_time_ends_and_has_time_for_the_head(flights, tmp_path):
     )
     assert 0 < result.steps < 200
     assert "head" in stages
+
+
+def test_weights_that_were_never_trained_are_not_kept(flights, tmp_path):
+    asked = settings(tmp_path, steps=None, minutes=0.01)
+    with pytest.raises(TrainingError, match="before the first step"):
+        train_policy(flights[:2], NETWORK, asked, replace(make_hooks(), now_s=count().__next__))
+    assert not asked.out.exists()
 
 
 def test_weights_that_diverge_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
