@@ -66,6 +66,7 @@ def write_output(path: Path, text: str, flag: str) -> None:
     is_plain = not path.is_symlink() and (path.is_file() or not path.exists())
     try:
         if is_plain:
+            path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 write_durably(path, text)
                 return
@@ -96,14 +97,13 @@ def _plain(value: object) -> object:
 
 
 def write_durably(path: Path, text: str) -> None:
-    """Replace a file atomically and durably.
+    """Replace a file atomically and durably, in a folder that is there.
 
     A failure or a loss of power leaves the old or the new content, and a failure no other file.
 
     Raises:
         OSError: the file cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}")
     temporary.unlink(missing_ok=True)  # left by a loss of power, or a stranger's link
     try:

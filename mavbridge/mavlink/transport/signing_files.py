@@ -127,6 +127,7 @@ class SigningStore:
         streams = {"/".join(map(str, stream)): ticks for stream, ticks in heard.items()}
         text = json.dumps({"sent_ticks": sent_ticks, "heard_ticks": streams})
         try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
             write_durably(self.path, text)
         except OSError as error:
             self.problem = (

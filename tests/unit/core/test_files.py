@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.core.files import write_durably
+from mavbridge.core.files import write_durably, write_output
 
 
 @pytest.mark.parametrize("fault", [errno.EINVAL, errno.EIO])
@@ -30,3 +30,12 @@ def test_a_file_system_that_writes_no_folders_to_the_disk_will_do(
         write_durably(tmp_path / "meta.json", "{}")
     assert [path.name for path in tmp_path.iterdir()] == ["meta.json"]
     assert (tmp_path / "meta.json").read_text() == "{}"
+
+
+def test_a_folder_that_was_removed_is_not_made_again(tmp_path: Path) -> None:
+    """It would look like a flight, of which nothing but its meta is there."""
+    with pytest.raises(FileNotFoundError):
+        write_durably(tmp_path / "flight" / "meta.json", "{}")
+    assert not (tmp_path / "flight").exists()
+    write_output(tmp_path / "new" / "out.json", "{}", "--out")
+    assert (tmp_path / "new" / "out.json").read_text() == "{}"
