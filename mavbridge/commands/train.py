@@ -121,8 +121,8 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
 
 def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightData]:
     camera_key = settings.camera_key
-    datasets = [path for path in paths if is_lerobot(path)]
-    own = [path for path in paths if path not in datasets]
+    datasets = dict.fromkeys(path.resolve() for path in paths if is_lerobot(path))
+    own = [path for path in paths if not is_lerobot(path)]
     folders = find_flights(own) if own else []
     folders, note = leave_out_failed(folders, include_failed=settings.include_failed)
     console = text_console(stderr=True)

@@ -109,6 +109,19 @@ def test_ctrl_c_keeps_the_best_weights_and_says_so(
     assert out.is_file()
 
 
+def test_a_dataset_that_is_named_twice_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its episodes would be both learned from and held out."""
+    (tmp_path / "set" / "meta").mkdir(parents=True)
+    (tmp_path / "set" / "meta" / "info.json").write_text("{}")
+    (tmp_path / "link").symlink_to(tmp_path / "set")
+    monkeypatch.setattr(run, "read_dataset", lambda path, _key: [path])
+    named = [tmp_path / "set", tmp_path / "link", tmp_path / "set" / ".." / "set"]
+    asked = TrainSettings(out=tmp_path / "a.safetensors")
+    assert run._read_flights(named, asked) == [(tmp_path / "set").resolve()]
+
+
 def test_the_policy_takes_frame_and_sticks_of_the_flights(tmp_path: Path) -> None:
     folder = write_spot_flight(tmp_path / "a", 0, seconds=0.3)
     sticks = {"modes": ["LOITER"], "full_lean_deg": 45.0, "throttle_dead_zone": 0.0}
