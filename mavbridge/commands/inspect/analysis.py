@@ -210,7 +210,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
         holders=holder_spans(ticks, start_ns, keeps_neutral=flight.meta.keeps_neutral),
         delays=delays,
-        moments=worst_moments(flight, ticks, frames, delays, limits),
+        moments=worst_moments(flight, ticks, delays, limits, cameras),
         limits=limits,
         damage=tuple(dict.fromkeys(damage)),
     )

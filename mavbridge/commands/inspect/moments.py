@@ -1,6 +1,6 @@
 """Missed slots and late chunks of a recorded flight with their causes, and its worst moments."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from typing import Literal, NamedTuple, TypeAlias
@@ -15,7 +15,7 @@ from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS, FlownChunk, FlownChunks
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
-from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.folder import FlightMeta
 
 Stamps: TypeAlias = NDArray[np.int64]
 Cause = Literal[
@@ -170,12 +170,13 @@ def _arrival_ns(
 def worst_moments(
     flight: RecordedFlight,
     ticks: Sequence[Tick],
-    frames: Sequence[FrameRow],
     delays: Sequence[Moment],
     limits: FreshnessLimits,
+    cameras: Mapping[str, RecordedFlight],
 ) -> tuple[Moment, ...]:
     """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
 
+    ``cameras``: the recording with the images of each camera, by name, in the contract's order;
     ``limits`` are the age limits of the flown chunks.
     """
     if not ticks:
@@ -186,7 +187,7 @@ def worst_moments(
         *delays,
         *_coasting(ticks, limits),
         *_old_images(ticks),
-        *_image_gaps(flight, frames, ticks),
+        *_image_gaps(cameras, ticks),
         *_rows_lost(flight, ticks),
     ]
     groups: list[list[Moment]] = []
@@ -287,18 +288,26 @@ def _old_images(ticks: Sequence[Tick]) -> Iterator[Moment]:
             yield Moment(_t_s(ticks, tick.woke_ns), "old image", older_ms, detail)
 
 
-def _image_gaps(
-    flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
-) -> Iterator[Moment]:
+def _image_gaps(cameras: Mapping[str, RecordedFlight], ticks: Sequence[Tick]) -> Iterator[Moment]:
     """Yield gaps between exposures from the first tick to the last, except the recorder's."""
-    period_ms = 1000 / flight.meta.visual_hz
-    for last, frame in pairwise(frames):
-        gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS
-        is_in_flight = ticks[0].woke_ns <= frame.captured_ns <= ticks[-1].woke_ns
-        if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight and not frame.dropped_before:
-            detail = f"{gap_ms:.0f} ms without an exposure that was used"
-            at_s = _t_s(ticks, frame.captured_ns)
-            yield Moment(at_s, "gap between images", gap_ms - period_ms, detail)
+    for number, (name, flight) in enumerate(cameras.items()):
+        period_ms = 1000 / _image_hz(flight.meta, number)
+        which = f" of camera {name}" if len(cameras) > 1 else ""
+        for last, frame in pairwise(flight.frame_rows()):
+            gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS
+            is_in_flight = ticks[0].woke_ns <= frame.captured_ns <= ticks[-1].woke_ns
+            if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight and not frame.dropped_before:
+                detail = f"{gap_ms:.0f} ms without an exposure{which} that was used"
+                at_s = _t_s(ticks, frame.captured_ns)
+                yield Moment(at_s, "gap between images", gap_ms - period_ms, detail)
+
+
+def _image_hz(meta: FlightMeta, number: int) -> float:
+    """Return the most images a second of a camera; the meta has that of the first."""
+    if number == 0 or not meta.contract.camera_rates_hz:
+        return meta.visual_hz
+    own_hz = meta.contract.camera_rates_hz[number]
+    return min(own_hz, meta.plan.get("vision_hz", own_hz))
 
 
 def _rows_lost(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:

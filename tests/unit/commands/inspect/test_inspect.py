@@ -237,6 +237,20 @@ def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: 
     assert "cut off" in text
 
 
+@pytest.mark.parametrize(("rates_hz", "gaps"), [((), 1), ((30.0, 2.0), 0)])
+def test_a_gap_of_any_camera_is_a_moment(
+    tmp_path: Path, rates_hz: tuple[float, ...], gaps: int
+) -> None:
+    contract = Contract(cameras=("front", "down"), camera_rates_hz=rates_hz)
+    late = [make_frame(number, camera=1, serial=at) for at, number in enumerate((0, 1, 14, 15))]
+    folder = write(
+        tmp_path / "flight", [*late, *flown(90)], frames=27, meta=make_meta(contract=contract)
+    )
+    told = [(each.what, each.detail) for each in analyse(folder).moments]
+    detail = "433 ms without an exposure of camera down that was used"
+    assert told == [("gap between images", detail)] * gaps
+
+
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_all_cameras_are_told_and_shown(tmp_path: Path, is_whole: bool) -> None:
     contract = Contract(cameras=("front", "down"))
