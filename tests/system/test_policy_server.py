@@ -23,7 +23,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from helpers.policy_servers import Guard, Reply, chunk_of, our_server, scripted_server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
-from policy.adapters.websocket import link, remote_policy
+from policy.adapters.websocket import remote_policy
 from policy.adapters.websocket.kind import load_server_policy
 from policy.adapters.websocket.messages import Message, number_array, pack, unpack
 from policy.adapters.websocket.remote_policy import RemotePolicy, answer_deadline_s
@@ -172,7 +172,7 @@ def test_a_server_of_another_policy_is_not_flown(contract_file: Path, is_ours: b
 def test_a_server_that_falls_silent_is_connected_to_again(
     contract_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link, "LOST_S", 0.05)
+    monkeypatch.setattr(remote_policy, "LOST_S", 0.05)
     monkeypatch.setattr(remote_policy, "MOST_WAIT_S", 0.05)
     guard = Guard()
     with scripted_server(guard.reply) as port:
@@ -256,7 +256,7 @@ def test_a_server_may_say_fields_that_the_file_lacks(
 def test_addresses_without_a_policy_server(
     contract_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link, "CONNECT_S", 0.5)
+    monkeypatch.setattr(remote_policy, "CONNECT_S", 0.5)
     with pytest.raises(PolicyError, match=r"nobody listens .* start the policy server"):
         load_server_policy(f"ws://127.0.0.1:{free_port(socket.SOCK_STREAM)}", None)
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -460,14 +460,14 @@ def test_a_server_with_a_key_lets_in_who_has_it(monkeypatch: pytest.MonkeyPatch)
     with our_server(served_echo(), api_key="secret") as port:
         url = f"ws://127.0.0.1:{port}"
         for key in ("", "wrong"):
-            monkeypatch.setenv(link.API_KEY_VARIABLE, key)
+            monkeypatch.setenv(remote_policy.API_KEY_VARIABLE, key)
             with pytest.raises(PolicyError, match=r"wants an API key.* MAVBRIDGE_API_KEY"):
                 load_server_policy(url, None)
         twice = dict.fromkeys(("Authorization", "authorization"), "Api-Key secret")
         for headers in ({"Authorization": "Api-Key other"}, twice):
             with pytest.raises(InvalidStatus, match="401"):
                 connect(port, **headers).__enter__()
-        monkeypatch.setenv(link.API_KEY_VARIABLE, "secret")
+        monkeypatch.setenv(remote_policy.API_KEY_VARIABLE, "secret")
         assert read_policy_contract(PolicyRequest(spec=url)).image_height == 32
         with connect(port, Authorization="Api-Key secret") as client:
             assert unpack(client.recv(PATIENT_S))
