@@ -232,8 +232,6 @@ class _Flight:
         listen = self._scheduled(partial(self._guard.listen, view=bridge.view))
         listener = Worker("mavbridge-guard", listen)
         settle_process()
-        # A second signal ends it before the guard: the last solves need what had arrived for them.
-        self._stack.callback(self._guard.read_rest, bridge.view)
         # Joined in reverse: the guard has ended before anything that feeds it is closed.
         for worker in (*visions, policy, listener):
             self._stack.callback(self._join, worker)

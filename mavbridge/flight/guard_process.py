@@ -156,16 +156,12 @@ class GuardProcess:
         silent_waits = 0
         while not (stop.is_set() or self._port.is_closed):
             is_heard = bool(select.select([self._port], [], [], LISTEN_S)[0])
-            self.read_rest(view)
+            for data in self._port.receive():
+                self._take(decode_from_guard(data), view)
             silent_waits = 0 if is_heard else silent_waits + 1
             if silent_waits == SILENT_WAITS and self._holds_vehicle():
                 return True
         return False
-
-    def read_rest(self, view: TelemetryCache) -> None:
-        """Pass on what has arrived; after ``listen``, what it left when it was stopped."""
-        for data in self._port.receive():
-            self._take(decode_from_guard(data), view)
 
     def _holds_vehicle(self) -> bool:
         """True if the last words could be sent now, were the guard dead."""

@@ -227,18 +227,6 @@ def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
     link.close()
 
 
-def test_a_stopped_listener_leaves_the_rest_to_be_read_later(rig: Rig) -> None:
-    heard: list[Any] = []
-    view, stop = View(), threading.Event()
-    view.receive = heard.append  # type: ignore[method-assign]
-    stop.set()
-    rig.tick()
-    rig.guard.listen(stop, view)
-    assert heard == []
-    rig.guard.read_rest(view)
-    assert len(heard) == 1
-
-
 @pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])
 def test_nothing_is_sent_where_it_would_be_wrong(rig: Rig, case: str) -> None:
     link = udp()
