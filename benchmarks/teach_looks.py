@@ -67,8 +67,8 @@ MOST_NOISE = 15.0
 """Largest standard deviation of the noise on a disturbed view, in levels of 0..255."""
 
 
-class Moment(NamedTuple):
-    """True state at the exposure of an image, and what the head got with the image's feature."""
+class Viewpoint(NamedTuple):
+    """True state at the exposure of an image, and what the head got with its feature."""
 
     body: BodyState
     state: FloatArray
@@ -84,7 +84,7 @@ class Views(NamedTuple):
     history: FloatArray
 
 
-def fly(seed: int, weights: Path) -> tuple[Course, list[Moment]]:
+def fly(seed: int, weights: Path) -> tuple[Course, list[Viewpoint]]:
     """Fly a course in training conditions by these weights; return the moments of its solves.
 
     Weights for body rates fly races, those for sticks easy courses.
@@ -115,7 +115,9 @@ def fly(seed: int, weights: Path) -> tuple[Course, list[Moment]]:
         logged = replace(runner, encode=encode, act=act)
         flight.fly(logged, max_time_s=FLIGHT_S, sinks=(frames,))
     known = {place: bodies[frame] for place, frame in enumerate(frames.ids)}
-    return flight.course, [Moment(known[at], *found) for at, found in solves.items() if at in known]
+    return flight.course, [
+        Viewpoint(known[at], *found) for at, found in solves.items() if at in known
+    ]
 
 
 class _Frames:
@@ -129,7 +131,7 @@ class _Frames:
             self.ids.append(event.frame_id)
 
 
-def draw(seed: int, course: Course, moments: list[Moment], contract: Contract) -> Views:
+def draw(seed: int, course: Course, moments: list[Viewpoint], contract: Contract) -> Views:
     """Draw ``VIEWS`` of the moments, some off the flown path, in the nominal look and in others."""
     random = np.random.default_rng((seed, 1))
     pairs, chosen = [], []
@@ -158,7 +160,7 @@ def draw(seed: int, course: Course, moments: list[Moment], contract: Contract) -
 
 
 def fly_and_draw(seed: int, weights: Path) -> Views:
-    """Return the views of one flight; runs in a process of its own."""
+    """Return the views of one flight; runs in a worker process."""
     torch.set_num_threads(1)
     course, moments = fly(seed, weights)
     return draw(seed, course, moments, load_checkpoint(weights, fallback=TogeConfig()).contract)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks import teach_looks
-from benchmarks.teach_looks import Kept, Moment, average_into, draw, load_toge, loss_of
+from benchmarks.teach_looks import Kept, Viewpoint, average_into, draw, load_toge, loss_of
 from policy.loading.builtin import SHIPPED_RATES
 from sitl.course import make_course
 from sitl.vehicle.dynamics import BodyState
@@ -25,7 +25,7 @@ def test_the_encoder_learns_the_nominal_feature_of_other_looks(
     random, teacher, net = np.random.default_rng(1), *map(load_toge, [SHIPPED_RATES] * 2)
     contract = teacher.contract
     moments = [
-        Moment(
+        Viewpoint(
             BodyState((8.0 * k, 2.0 * k, -1.5), (1.0, 0.0, 0.0, 0.0), STILL, STILL, STILL, False),
             random.normal(0.0, 0.5, contract.state_dim).astype(np.float32),
             np.zeros((contract.history_len, 4), np.float32),
