@@ -37,6 +37,8 @@ from policy.contract import Contract, FloatArray
 from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import fit_image
 from policy.training.batches import disturb, normalise_image
+from policy.training.run import GRADIENT_LIMIT, computing_in, update_average, uses_bf16
+from policy.training.settings import learning_rate_factor
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import Course
 from sitl.vehicle.conditions import NOMINAL
@@ -84,12 +86,11 @@ class Views(NamedTuple):
     history: FloatArray
 
 
-def fly(seed: int, weights: Path) -> tuple[Course, list[Viewpoint]]:
+def fly(seed: int, weights: Path, *, by_rates: bool) -> tuple[Course, list[Viewpoint]]:
     """Fly a course in training conditions by these weights; return the moments of its solves.
 
     Weights for body rates fly races, those for sticks easy courses.
     """
-    by_rates = load_toge(weights).contract.action == "rates"
     courses: CourseKind = "race" if by_rates else "easy"
     conditions, is_px4 = training_conditions(seed), seed % 8 == 0
     vehicle = make_vehicle(autopilot="px4" if is_px4 else "ardupilot", conditions=conditions)
@@ -162,8 +163,9 @@ def draw(seed: int, course: Course, moments: list[Viewpoint], contract: Contract
 def fly_and_draw(seed: int, weights: Path) -> Views:
     """Return the views of one flight; runs in a worker process."""
     torch.set_num_threads(1)
-    course, moments = fly(seed, weights)
-    return draw(seed, course, moments, load_checkpoint(weights, fallback=TogeConfig()).contract)
+    contract = load_toge(weights).contract
+    course, moments = fly(seed, weights, by_rates=contract.action == "rates")
+    return draw(seed, course, moments, contract)
 
 
 class Kept:
@@ -224,7 +226,7 @@ def loss_of(net: Toge, batch: list[Tensor]) -> Tensor:
     def chunk(of: Tensor) -> Tensor:
         return net.head.read(net.condition(of, net.state_encoder(state), history))
 
-    with torch.autocast("cpu", torch.bfloat16):
+    with computing_in(images.device, uses_bf16("auto", images.device)):
         code = net.backbone(images.contiguous(memory_format=torch.channels_last))
     seen = net.visual_projection(code.float())
     wanted = chunk(feature)
@@ -233,13 +235,6 @@ def loss_of(net: Toge, batch: list[Tensor]) -> Tensor:
     # Roots: views that show no gate at all must not outweigh the others.
     loss: Tensor = 0.3 * (of_feature + 3e-3).sqrt().mean() + (of_chunk + 1e-3).sqrt().mean()
     return loss
-
-
-def average_into(average: Toge, net: Toge, step: int) -> None:
-    """Update a running average of the weights, over more steps the more there were."""
-    share = max(1.0 - AVERAGED, 9.0 / (10.0 + step))
-    for mean, value in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
-        mean.copy_(torch.lerp(mean, value, share) if mean.is_floating_point() else value)
 
 
 def load_toge(path: Path) -> Toge:
@@ -280,14 +275,13 @@ def main(before: Path, *, out: Path, minutes: float, workers: int = 1) -> None:
             for flight in done:
                 kept.add(flight.result())
                 flights.add(pool.submit(fly_and_draw, next(seeds), newest))
-            fall = (1.0 + math.cos(math.pi * share)) / 2.0
-            optimiser.param_groups[0]["lr"] = MOST_RATE * min(1.0, step / REPORTED) * fall
+            optimiser.param_groups[0]["lr"] = MOST_RATE * learning_rate_factor(share)
             loss = loss_of(net, kept.batch(random))
             optimiser.zero_grad()
             torch.autograd.backward(loss)
-            torch.nn.utils.clip_grad_norm_(taught, 1.0)
+            torch.nn.utils.clip_grad_norm_(taught, GRADIENT_LIMIT)
             optimiser.step()
-            average_into(average, net, step)
+            update_average(average, net, AVERAGED, step)
             losses.append(loss.item())
             if step % REPORTED == 0:
                 said = f"step {step}: {len(kept)} flights, loss {np.mean(losses):.3f}"

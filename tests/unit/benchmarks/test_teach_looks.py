@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from benchmarks import teach_looks
-from benchmarks.teach_looks import Kept, Viewpoint, average_into, draw, load_toge, loss_of
+from benchmarks.teach_looks import Kept, Viewpoint, draw, load_toge, loss_of
 from policy.loading.builtin import SHIPPED_RATES
+from policy.training.run import update_average
 from sitl.course import make_course
 from sitl.vehicle.dynamics import BodyState
 
@@ -55,7 +56,7 @@ def test_the_encoder_learns_the_nominal_feature_of_other_looks(
         optimiser.step()
     with torch.inference_mode():
         assert loss_of(net, batch) < loss_of(before, batch)
-    average_into(before, net, step=1)
+    update_average(before, net, teach_looks.AVERAGED, 1)
     moved = before.visual_projection[0].weight - teacher.visual_projection[0].weight
     whole = net.visual_projection[0].weight - teacher.visual_projection[0].weight
     torch.testing.assert_close(moved, 9 / 11 * whole)
