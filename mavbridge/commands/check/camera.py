@@ -55,6 +55,8 @@ class CameraView:
     is_stamped: bool = False
     """True if the source tells the exposures."""
     dropped: int = 0
+    silent_ns: int = 0
+    """Time from the newest frame's arrival to the end of the watch."""
     failure: str | None = None
 
     @property
@@ -111,7 +113,8 @@ def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
 
 
 def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event) -> None:
-    until_ns = clock.now_ns() + round(MEASURE_S * NS_PER_S)
+    heard_ns = clock.now_ns()
+    until_ns = heard_ns + round(MEASURE_S * NS_PER_S)
     dropped_before = camera.dropped_frames
     try:
         while clock.now_ns() < until_ns and not stop.is_set():
@@ -120,18 +123,22 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
                 continue
             if seen.image is None:
                 dropped_before = camera.dropped_frames
-            seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
+            heard_ns = clock.now_ns()
+            seen.ages_ns.append(heard_ns - frame.captured_ns)
             seen.captured_ns.append(frame.captured_ns)
             seen.image, seen.is_stamped = frame.rgb, frame.is_stamped
     except CameraError as error:
         seen.failure = str(error)
     seen.dropped = camera.dropped_frames - dropped_before
+    seen.silent_ns = clock.now_ns() - heard_ns
 
 
 def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[CheckRow]:
     """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
-    if seen.failure is not None or seen.image is None:
-        why = seen.failure or f"no frame came in {MEASURE_S:g} s"
+    silent_s = seen.silent_ns / NS_PER_S
+    has_stopped = silent_s > max(need.max_age_s, 1 / need.rate_hz)
+    if seen.failure is not None or seen.image is None or has_stopped:
+        why = seen.failure or f"no frame came in the last {silent_s:.1f} s"
         return [_row(need, "stopped", no_go=why)]
     slow = (
         f"the camera delivers {seen.rate_hz:.1f} images a second of {need.rate_hz:.3g}: more "

@@ -55,6 +55,8 @@ def test_a_camera_that_does_all_that_is_needed_is_a_go() -> None:
     [
         (needs(), seen(period_ns=2 * FRAME_NS), 0.0, "rate", "warn"),
         (needs(), seen(period_ns=2 * FRAME_NS, dropped=59), 0.0, "rate", "go"),  # passed over
+        (needs(), seen(silent_ns=600 * NS_PER_MS), 0.0, "", "no-go"),  # it has stopped
+        (needs(rate_hz=1.0), seen(silent_ns=600 * NS_PER_MS), 0.0, "rate", "go"),
         (needs("pipe:cat"), seen(is_stamped=False), 0.0, "age when read", "warn"),  # on arrival
         (needs("pipe:cat"), seen(is_stamped=False), 120.0, "age when read", "go"),
         (needs(), seen(age_ms=0.1), 0.0, "age when read", "go"),  # its writer stamps the exposure
