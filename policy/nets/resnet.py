@@ -179,9 +179,22 @@ class ResNet8(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Apply a fully connected layer to the cells of the last map."""
         x = self.layers(self.relu(self.bn1(self.conv1(image))))
-        cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
+        x = self.relu(self.bn2(self.conv2(x)))
+        is_uneven = any(int(side) % RESNET8_CELLS for side in x.shape[2:])
+        if is_uneven and torch.onnx.is_in_onnx_export():
+            cells = _pooled(_pooled(x, 2), 3)
+        else:
+            cells = F.adaptive_avg_pool2d(x, RESNET8_CELLS)
         feature: Tensor = self.relu(self.fc(cells.flatten(1)))
         return feature
+
+
+def _pooled(x: Tensor, axis: int) -> Tensor:
+    """Pool an axis as ``adaptive_avg_pool2d`` does, which ONNX has for multiples of the cells."""
+    size, cells = int(x.shape[axis]), range(RESNET8_CELLS)
+    spans = [(k * size // RESNET8_CELLS, -(-(k + 1) * size // RESNET8_CELLS)) for k in cells]
+    parts = [x.narrow(axis, start, end - start).mean(axis) for start, end in spans]
+    return torch.stack(parts, axis)
 
 
 def build_backbone(name: BackboneName) -> ResNet | ResNet8:
