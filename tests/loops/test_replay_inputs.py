@@ -30,7 +30,7 @@ from mavbridge.simulation.replay.compare import (
     compare_policy,
 )
 from mavbridge.simulation.replay.guard import recorded_plan, replay_guard, replay_other
-from mavbridge.simulation.replay.policy import replay_policy
+from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
@@ -125,6 +125,17 @@ def flown_and_repeated(
     autopilot: AutopilotName = "ardupilot",
 ) -> PolicyComparison:
     """A short flight, and every solve of it once more."""
+    return compare_policy(flown_and_paired(monkeypatch, make, make, goal, autopilot))
+
+
+def flown_and_paired(
+    monkeypatch: pytest.MonkeyPatch,
+    make: Callable[[], PolicyRunner],
+    other: Callable[[], PolicyRunner],
+    goal: str | None = None,
+    autopilot: AutopilotName = "ardupilot",
+) -> list[SolvePair]:
+    """A short flight, and every solve of it once more, by the other policy."""
     flown, compose = Flown(), simulation.build_bridge
 
     def recorded(*arguments: Any, **named: Any) -> Any:
@@ -145,7 +156,7 @@ def flown_and_repeated(
     one.fly(runner, max_time_s=FLIGHT_S, sinks=(flown.sink,))
     source = flown.source(runner, goal)
     clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
-    return compare_policy(replay_policy(source, make(), clock, source.features))
+    return list(replay_policy(source, other(), clock, source.features))
 
 
 def attentive(kind: type[Attentive] = Attentive, **changes: Any) -> Callable[[], PolicyRunner]:
@@ -182,6 +193,15 @@ def test_every_field_of_the_state_is_repeated_bit_for_bit(
     goal = "5,2,-3" if "goal" in changes.get("state_extras", ()) else None
     compared = flown_and_repeated(monkeypatch, attentive(**changes), goal=goal)
     assert_equal(compared)
+
+
+def test_another_policy_is_given_the_past_images_of_its_own_contract(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    newest_only, also_past = attentive(), attentive(observation_steps=2, observation_dt_s=0.3)
+    pairs = flown_and_paired(monkeypatch, newest_only, also_past)
+    past, newest = np.array([pair.replayed.frame_ids for pair in pairs if pair.replayed])[-10:].T[0]
+    assert (newest - past).tolist() == [9] * 10  # 0.3 s at 30 Hz
 
 
 def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(

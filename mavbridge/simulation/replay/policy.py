@@ -83,7 +83,7 @@ class _Loop:
         self._refusal: Reason | None = None
         self._act = runner.act
         self._takes_recorded = runner.contract == contract
-        span_ns = observation_ages_ns(contract)[0]
+        span_ns = observation_ages_ns(runner.contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
         plan = plan_flight(source.config, runner.contract, is_dual=runner.dual_rate)
         bridge = build_bridge(
