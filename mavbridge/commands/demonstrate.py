@@ -132,7 +132,11 @@ def _meta(
         seed=spec.seed,
         conditions=variation.conditions.numbers(),
         policy_files=spec.weights,
-        plan={"speed_mps": spec.config.speed, "solve_time_ms": spec.config.solve_time},
+        plan={
+            "speed_mps": spec.config.speed,
+            "solve_time_ms": spec.config.solve_time,
+            "max_time_s": spec.config.max_time,
+        },
     )
 
 
@@ -234,6 +238,7 @@ def _differences(meta: FlightMeta, spec: DemonstrationSpec) -> str:
         "--action": (meta.contract.action, config.action),
         "--speed": (meta.plan.get("speed_mps"), config.speed),
         "--solve-time": (meta.plan.get("solve_time_ms"), config.solve_time),
+        "--max-time": (meta.plan.get("max_time_s", config.max_time), config.max_time),
         "--policy": (meta.policy, config.policy.policy if config.has_student else meta.policy),
         "network.image_size": (size_px, asked_px),
         "--checkpoint": tuple(

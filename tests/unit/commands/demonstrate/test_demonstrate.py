@@ -93,9 +93,11 @@ def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
 ) -> None:
     kept, unfinished = tmp_path / "000000", tmp_path / "000001"
     shutil.copytree(flight.folder, kept)
+    flown = replace(flight.meta, plan=flight.meta.plan | {"max_time_s": 1.0})
+    write_meta(kept, flown)
     meta = (kept / "meta.json").read_text()
     unfinished.mkdir()
-    write_meta(unfinished, replace(flight.meta, finished=False, course_seed=30_001))
+    write_meta(unfinished, replace(flown, finished=False, course_seed=30_001))
     (unfinished / "ticks.arrows").write_bytes(b"")
     assert demonstrate(config(tmp_path, episodes=2, max_time=1.0)) == 0
     assert (kept / "meta.json").read_text() == meta
@@ -116,6 +118,7 @@ def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
         ({"action": "rates"}, "--action sticks, not rates", True),
         ({"autopilot": "px4"}, "--autopilot ardupilot, not px4", False),
         ({"speed": 9.0}, r"--speed 6\.0, not 9\.0", True),
+        ({"max_time": 60.0}, r"--max-time 40\.0, not 60\.0", True),
         ({"policy": PolicyConfig(checkpoint=SHIPPED, seed=3)}, "--checkpoint none, not ", False),
         ({"policy": PolicyConfig(image_size=64, seed=3)}, "image_size 48, not 64", True),
     ],
