@@ -82,6 +82,8 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
         log = flight.vehicle.log
         success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
         writer.finish(replace(writer.meta, success=success, gates_passed=result.gates_passed))
+        if writer.video_failure is not None:
+            raise writer.video_failure
     return success
 
 

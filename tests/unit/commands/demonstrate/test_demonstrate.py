@@ -1,8 +1,9 @@
 """Demonstrations are flights: recorded, labelled, resumable, and the same for the same seed."""
 
+import multiprocessing
 import shutil
 from dataclasses import replace
-from itertools import chain, repeat
+from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.folder import write_meta
+from mavbridge.recording.video_writer import WriterDiedError
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED, SHIPPED_RATES
@@ -153,6 +155,21 @@ def test_an_interrupted_demonstration_is_unfinished(tmp_path: Path) -> None:
     answers = chain(repeat(False, 2_000), repeat(True))  # 5 s of vehicle steps
     with pytest.raises(EpisodeInterruptedError):
         fly_demonstration(spec, lambda: next(answers))
+    assert not open_flight(spec.folder).meta.finished
+
+
+def test_a_demonstration_without_its_images_has_failed(tmp_path: Path) -> None:
+    spec = DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=config(tmp_path))
+    steps = count()
+
+    def kill_the_writer() -> bool:
+        if next(steps) == 2_000:  # 5 s of vehicle steps
+            for child in multiprocessing.active_children():
+                child.kill()
+        return False
+
+    with pytest.raises(WriterDiedError):
+        fly_demonstration(spec, kill_the_writer)
     assert not open_flight(spec.folder).meta.finished
 
 
