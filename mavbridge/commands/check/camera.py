@@ -136,7 +136,7 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
 def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[CheckRow]:
     """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
     silent_s = seen.silent_ns / NS_PER_S
-    has_stopped = silent_s > max(need.max_age_s, 1 / need.rate_hz)
+    has_stopped = silent_s > max(need.max_age_s, 2 / need.rate_hz)
     if seen.failure is not None or seen.image is None or has_stopped:
         why = seen.failure or f"no frame came in the last {silent_s:.1f} s"
         return [_row(need, "stopped", no_go=why)]
