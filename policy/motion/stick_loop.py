@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policy.contract import QUATERNION, RATE, VELOCITY, Contract, FloatArray
+from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
 from policy.motion.rotation import (
     Array,
@@ -38,6 +38,12 @@ UP_FORCE_MPS2 = (3.0, 21.0)
 """Least and largest vertical specific force."""
 MIN_COS_TILT = 0.35
 """Cosine of the lean beyond which the thrust no longer holds the height."""
+SOLVES = (40, 100)
+"""Solves that thrust and force are averaged over: at first, and later (a second at 100 Hz)."""
+LEAST_SPEED_MPS = 1.0
+"""Speed from which a vehicle is in the air for certain: on the ground, thrust changes no force."""
+THRUST_GAINS = (0.6, 2.0)
+"""Least and largest factor on thrust."""
 RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
 RATES_FULL_CLIMB_MPS = 6.0
@@ -92,12 +98,49 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
     Its network gets a history of centred sticks, because the sent actions are rates.
     """
     loop = StickLoop(by_rates(runner.contract))
+    gain, newest = ThrustGain(loop.contract.hover_thrust), loop.contract.history_len - 1
     centred = np.zeros((1, *runner.contract.history_shape), np.float32)
 
-    def act(encoded: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
-        return loop.to_rates(runner.act(encoded, state, centred), state)
+    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        if float(np.linalg.norm(state[0, VELOCITY])) > LEAST_SPEED_MPS:
+            gain.update(float(history[0, newest, 0]), -float(state[0, SPECIFIC_FORCE.stop - 1]))
+        return loop.to_rates(runner.act(encoded, state, centred), state, gain.value)
 
-    return replace(runner, contract=loop.contract, act=act)
+    def reset() -> None:
+        gain.reset()
+        runner.reset()
+
+    return replace(runner, contract=loop.contract, act=act, reset=reset)
+
+
+class ThrustGain:
+    """Thrust that this vehicle needs for a force, over the thrust that it needed in training.
+
+    Measured in flight, from the thrust that was sent and the specific force along it: what differs
+    is the weight, the battery, and the drag of air that comes through the rotors.
+    """
+
+    def __init__(self, hover_thrust: float) -> None:
+        self._hover_thrust = hover_thrust
+        self.reset()
+
+    def reset(self) -> None:
+        """Start from the vehicle of training."""
+        self._thrust, self._up_mps2 = self._hover_thrust, GRAVITY_MPS2
+        self._solves = SOLVES[0]
+
+    def update(self, thrust: float, up_mps2: float) -> None:
+        """Add the newest sent thrust in [0, 1], and the specific force along it [m/s^2]."""
+        self._thrust += (thrust - self._thrust) / self._solves
+        self._up_mps2 += (up_mps2 - self._up_mps2) / self._solves
+        self._solves = min(self._solves + 1, SOLVES[1])
+
+    @property
+    def value(self) -> float:
+        """Factor on thrusts."""
+        expected_mps2 = self._thrust / self._hover_thrust * GRAVITY_MPS2
+        least, most = THRUST_GAINS
+        return min(max(expected_mps2 / max(self._up_mps2, 1.0), least), most)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +161,9 @@ class StickLoop:
                 f"{self.contract.state_frame}: train it on flights of mavbridge demonstrate"
             )
 
-    def to_rates(self, sticks: FloatArray, state: FloatArray) -> FloatArray:
+    def to_rates(
+        self, sticks: FloatArray, state: FloatArray, thrust_gain: float = 1.0
+    ) -> FloatArray:
         """Convert sticks [1, horizon, 4] at a state [1, state_dim] to rates [1, horizon, 4].
 
         Each action assumes the attitude and climb that the actions before it bring about.
@@ -129,7 +174,7 @@ class StickLoop:
         p, q, r = numbers[RATE]
         attitude = turned((w, x, y, z), (p, q, r), LAG_S)
         climb_mps = -numbers[VELOCITY][2]
-        dt_s, hover = self.contract.chunk_dt_s, self.contract.hover_thrust
+        dt_s, hover = self.contract.chunk_dt_s, thrust_gain * self.contract.hover_thrust
         for step, positions in enumerate(sticks[0].tolist()):
             wanted = motion_of_sticks(self.contract, *positions)
             up_mps2, cos_tilt, rate = self.demand(wanted, attitude, climb_mps)

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from policy.contract import Contract, FloatArray
+from policy.contract import SPECIFIC_FORCE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
 from policy.motion.rotation import multiply
 from policy.motion.stick_loop import (
+    GRAVITY_MPS2,
     MAX_TILT_RATE_RADPS,
+    THRUST_GAINS,
     StickLoop,
     by_rates,
     flown_by_rates,
@@ -115,17 +117,54 @@ def test_sticks_are_read_back_from_the_rates_that_flew_them(contract: Contract) 
         assert np.abs(back[~beyond]).max(initial=0.0) <= contract.lean_dead_zone + 1e-3
 
 
-def test_what_was_sent_are_rates_so_the_network_sees_centred_sticks() -> None:
-    given: list[FloatArray] = []
+def flown(given: list[FloatArray]) -> PolicyRunner:
+    """A policy of centred sticks, flown by rates; appends what its network gets as history."""
 
     def act(_encoded: FloatArray, _state: FloatArray, history: FloatArray) -> FloatArray:
         given.append(history)
         return np.zeros((1, 16, 4), np.float32)
 
     parts = {"encode": lambda _rgb, _camera=0: np.zeros((1, 1), np.float32), "act": act}
-    runner = PolicyRunner(contract=Contract(), name="s", engine="numpy", dual_rate=True, **parts)
-    flown_by_rates(runner).act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), "f4"))
+    contract = Contract(hover_thrust=0.5)
+    runner = PolicyRunner(contract=contract, name="s", engine="numpy", dual_rate=True, **parts)
+    return flown_by_rates(runner)
+
+
+def test_what_was_sent_are_rates_so_the_network_sees_centred_sticks() -> None:
+    given: list[FloatArray] = []
+    flown(given).act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), "f4"))
     assert not given[0].any()
+
+
+@pytest.mark.parametrize(
+    ("sent", "up_mps2", "factor"),
+    [
+        (0.5, GRAVITY_MPS2, 1.0),
+        (0.6, GRAVITY_MPS2, 1.2),  # a heavier vehicle, or an empty battery
+        (0.5, 1.25 * GRAVITY_MPS2, 0.8),  # a lighter one climbs
+        (0.75, 1.5 * GRAVITY_MPS2, 1.0),  # a climb that the thrust explains
+        (0.9, 0.1, THRUST_GAINS[1]),  # it falls whatever is sent
+        (0.0, GRAVITY_MPS2, THRUST_GAINS[0]),
+    ],
+)
+def test_thrust_follows_the_force_that_the_sent_thrust_brought_about(
+    sent: float, up_mps2: float, factor: float
+) -> None:
+    policy = flown([])
+    history = np.full((1, 4, 4), [sent, 0.0, 0.0, 0.0], np.float32)
+
+    def last_thrust(speed_mps: float, solves: int) -> float:
+        at = state()
+        at[0, VELOCITY], at[0, SPECIFIC_FORCE] = (speed_mps, 0.0, 0.0), (0.0, 0.0, -up_mps2)
+        for _ in range(solves):
+            rates = policy.act(np.zeros((1, 1), np.float32), at, history)[0, 0]
+        return float(rates[0])
+
+    assert last_thrust(0.9, 300) == pytest.approx(0.5), "it may still stand on the ground"
+    for _ in range(2):
+        assert last_thrust(2.0, 1) == pytest.approx(0.5, rel=0.05)
+        assert last_thrust(2.0, 600) == pytest.approx(0.5 * factor, rel=0.01)
+        policy.reset()
 
 
 def test_other_axes_are_refused() -> None:
