@@ -41,7 +41,7 @@ MIN_COS_TILT = 0.35
 SOLVES = (40, 100)
 """Solves that thrust and force are averaged over: at first, and later (a second at 100 Hz)."""
 LEAST_SPEED_MPS = 1.0
-"""Speed from which a vehicle is in the air for certain: on the ground, thrust changes no force."""
+"""Speed that only a vehicle in the air reaches: on the ground, thrust changes no force."""
 THRUST_GAINS = (0.6, 2.0)
 """Least and largest factor on thrust."""
 RATES_FULL_LEAN_DEG = 65.0
@@ -102,8 +102,7 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
     centred = np.zeros((1, *runner.contract.history_shape), np.float32)
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        if float(np.linalg.norm(state[0, VELOCITY])) > LEAST_SPEED_MPS:
-            gain.update(float(history[0, newest, 0]), -float(state[0, SPECIFIC_FORCE.stop - 1]))
+        gain.update(history[0, newest, 0].item(), state[0])
         return loop.to_rates(runner.act(encoded, state, centred), state, gain.value)
 
     def reset() -> None:
@@ -116,8 +115,8 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
 class ThrustGain:
     """Thrust that this vehicle needs for a force, over the thrust that it needed in training.
 
-    Measured in flight, from the thrust that was sent and the specific force along it: what differs
-    is the weight, the battery, and the drag of air that comes through the rotors.
+    Measured from the thrust that was sent and the specific force along it: what differs is the
+    weight, the battery, and the drag of air that comes through the rotors.
     """
 
     def __init__(self, hover_thrust: float) -> None:
@@ -127,10 +126,14 @@ class ThrustGain:
     def reset(self) -> None:
         """Start from the vehicle of training."""
         self._thrust, self._up_mps2 = self._hover_thrust, GRAVITY_MPS2
-        self._solves = SOLVES[0]
+        self._solves, self._is_flying = SOLVES[0], False
 
-    def update(self, thrust: float, up_mps2: float) -> None:
-        """Add the newest sent thrust in [0, 1], and the specific force along it [m/s^2]."""
+    def update(self, thrust: float, state: FloatArray) -> None:
+        """Add the newest sent thrust in [0, 1], and a state [state_dim]."""
+        self._is_flying |= float(np.linalg.norm(state[VELOCITY])) > LEAST_SPEED_MPS
+        if not self._is_flying:
+            return
+        up_mps2 = -state[SPECIFIC_FORCE][2].item()
         self._thrust += (thrust - self._thrust) / self._solves
         self._up_mps2 += (up_mps2 - self._up_mps2) / self._solves
         self._solves = min(self._solves + 1, SOLVES[1])
