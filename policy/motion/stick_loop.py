@@ -39,10 +39,10 @@ UP_FORCE_MPS2 = (3.0, 21.0)
 MIN_COS_TILT = 0.35
 """Cosine of the lean beyond which the thrust no longer holds the height."""
 SOLVES = (40, 100)
-"""Solves that thrust and force are averaged over: at first, and later (a second at 100 Hz)."""
+"""Solves that thrust, force and drag are averaged over: at first, and later (1 s at 100 Hz)."""
 LEAST_SPEED_MPS = 1.0
 """Speed that only a vehicle in the air reaches: on the ground, thrust changes no force."""
-THRUST_GAINS = (0.6, 2.0)
+THRUST_GAINS = (0.6, 1.6)
 """Least and largest factor on thrust."""
 RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
@@ -115,8 +115,9 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
 class ThrustGain:
     """Thrust that this vehicle needs for a force, over the thrust that it needed in training.
 
-    Measured from the thrust that was sent and the specific force along it: what differs is the
-    weight, the battery, and the drag of air that comes through the rotors.
+    Measured from the sent thrust and the specific force along it, for weight and battery. Drag is
+    left to the network, whose training had it: it counts as proportional to the velocity, with the
+    factor by which the vehicle brakes across the thrust.
     """
 
     def __init__(self, hover_thrust: float) -> None:
@@ -126,17 +127,26 @@ class ThrustGain:
     def reset(self) -> None:
         """Start from the vehicle of training."""
         self._thrust, self._up_mps2 = self._hover_thrust, GRAVITY_MPS2
+        self._braking_wpkg = self._across_m2ps2 = 0.0
         self._solves, self._is_flying = SOLVES[0], False
 
     def update(self, thrust: float, state: FloatArray) -> None:
         """Add the newest sent thrust in [0, 1], and a state [state_dim]."""
-        self._is_flying |= float(np.linalg.norm(state[VELOCITY])) > LEAST_SPEED_MPS
+        numbers: list[float] = state.tolist()
+        w, i, j, k = numbers[QUATERNION]
+        north, east, down = numbers[VELOCITY]
+        vx, vy, vz = rotate(conjugate((w, i, j, k)), (north, east, down))
+        fx, fy, fz = numbers[SPECIFIC_FORCE]
+        self._is_flying |= math.hypot(vx, vy, vz) > LEAST_SPEED_MPS
         if not self._is_flying:
             return
-        up_mps2 = -state[SPECIFIC_FORCE][2].item()
-        self._thrust += (thrust - self._thrust) / self._solves
-        self._up_mps2 += (up_mps2 - self._up_mps2) / self._solves
+        share = 1.0 / self._solves
         self._solves = min(self._solves + 1, SOLVES[1])
+        self._braking_wpkg -= share * (fx * vx + fy * vy + self._braking_wpkg)
+        self._across_m2ps2 += share * (vx * vx + vy * vy - self._across_m2ps2)
+        drag_per_s = max(self._braking_wpkg / max(self._across_m2ps2, 1.0), 0.0)
+        self._thrust += share * (thrust - self._thrust)
+        self._up_mps2 += share * (-fz - drag_per_s * vz - self._up_mps2)
 
     @property
     def value(self) -> float:

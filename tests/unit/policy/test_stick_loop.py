@@ -6,14 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from policy.contract import SPECIFIC_FORCE, VELOCITY, Contract, FloatArray
+from policy.contract import QUATERNION, SPECIFIC_FORCE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
-from policy.motion.rotation import multiply
+from policy.motion.rotation import conjugate, multiply, rotate
 from policy.motion.stick_loop import (
     GRAVITY_MPS2,
     MAX_TILT_RATE_RADPS,
     THRUST_GAINS,
     StickLoop,
+    ThrustGain,
     by_rates,
     flown_by_rates,
     rates_contract,
@@ -165,6 +166,17 @@ def test_thrust_follows_the_force_that_the_sent_thrust_brought_about(
         assert last_thrust(2.0, 1) == pytest.approx(0.5, rel=0.05)
         assert last_thrust(0.0, 600) == pytest.approx(0.5 * factor, rel=0.01), "it has stopped"
         policy.reset()
+
+
+@pytest.mark.parametrize("weight", [1.0, 1.2])
+def test_drag_through_the_rotors_is_not_taken_for_weight(weight: float) -> None:
+    gain, at = ThrustGain(0.5), state(40.0)[0]
+    at[VELOCITY] = velocity = np.array([9.0, 0.0, 1.0])
+    velocity_body = rotate(conjugate(tuple(at[QUATERNION])), tuple(velocity))
+    at[SPECIFIC_FORCE] = -0.7 * np.array(velocity_body) - [0.0, 0.0, 1.3 * GRAVITY_MPS2 / weight]
+    for _ in range(600):
+        gain.update(0.65, at)
+    assert gain.value == pytest.approx(weight, rel=1e-3)
 
 
 def test_other_axes_are_refused() -> None:
