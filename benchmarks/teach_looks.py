@@ -51,7 +51,7 @@ app = App(help=__doc__)
 FIRST_SEED = 600_000
 """Of the flights: neither demonstrations nor evaluations have these courses."""
 FLIGHT_S = 35.0
-VIEWS, VIEWS_OF_A_LOOK = 2000, 80
+VIEWS, VIEWS_OF_A_LOOK = 1000, 100
 """Moments drawn of each flight, and how many of them in one look."""
 CAPACITY = 160_000
 """Moments kept, each with two views; the oldest are replaced."""
