@@ -113,6 +113,7 @@ class Flown:
                 RecordedPacket(p.arrived_ns, p.happened_ns, p.data) for p in self.packets
             ),
             known_params=frozenset(),
+            requested_ns=(),
             gaps=(),
         )
 
@@ -294,8 +295,23 @@ def test_a_mode_that_is_entered_before_the_slot_after_its_request_is_no_takeover
     assert [tick.phase.value for tick in ticks] == [tick.phase for tick in source.ticks]
 
 
+@pytest.mark.parametrize("seed", [5, 6])
+def test_passes_of_the_guard_at_any_times_are_repeated(seed: int) -> None:
+    """Parameters that the vehicle lacks are asked for again in the first pass after a timeout."""
+    flight, random = OutputFlight("px4", "sticks", arm=True), np.random.default_rng(seed)
+    while flight.phase is not Phase.FLYING:
+        flight.run(random.uniform(0.0005, 0.01))
+        flight.guard.step()
+    flight.run(0.2)
+    assert compare_guard(replay_guard(recorded(flight, arm=True))).differ == {}
+
+
 def recorded(flight: OutputFlight, **config: Any) -> ReplaySource:
-    requests = [m for _, m in flight.left() if m.get_type() == "PARAM_REQUEST_READ"]
+    requests = [
+        (at_ns, m)
+        for at_ns, m in flight.left()
+        if m.get_type() in ("PARAM_REQUEST_READ", "COMMAND_LONG")
+    ]
     return ReplaySource(
         folder=Path("in memory"),
         meta=make_meta(
@@ -306,6 +322,7 @@ def recorded(flight: OutputFlight, **config: Any) -> ReplaySource:
         solves=tuple(flight.solves),
         features=((),),
         packets=tuple(RecordedPacket(r.arrived_ns, None, r.data) for r in flight.network.received),
-        known_params=frozenset(m.param_id for m in requests),
+        known_params=frozenset(m.param_id for _, m in requests if hasattr(m, "param_id")),
+        requested_ns=tuple(at_ns for at_ns, _ in requests),
         gaps=(),
     )

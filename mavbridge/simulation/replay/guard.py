@@ -7,6 +7,7 @@ the operator or the flight process are derived from the phases, refused or absen
 reason for the end.
 """
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -89,7 +90,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     clock = SteppedClock(
         min(source.packets[0].arrived_ns if source.packets else ticks[0].woke_ns, ticks[0].woke_ns)
     )
-    transport = _RecordedTransport(clock, source.packets)
+    transport = _RecordedTransport(clock, source.packets, source.requested_ns)
     link = _link(source, clock, transport)
     port = _RecordedPort(clock)
     loop = GuardLoop(clock, link, port)
@@ -155,7 +156,7 @@ def _keep_link(
 def _arrived(
     link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
 ) -> Iterator[None]:
-    """Advance the clock to ``until_ns``; yield at each arrival before, or soon.
+    """Advance the clock to ``until_ns``; yield at each arrival and request before, or soon.
 
     It also services the link just before each arrival, since the packet may be the answer to a
     request: a vehicle selected a moment later would still be ignored.
@@ -163,10 +164,10 @@ def _arrived(
     while clock.now_ns() < until_ns:
         arrival_ns = transport.next_arrival_ns or until_ns
         if arrival_ns - 1 > clock.now_ns():
-            clock.sleep_until_ns(min(arrival_ns - 1, clock.now_ns() + PREPARE_NS, until_ns))
+            clock.sleep_until_ns(min(arrival_ns - 1, transport.stop_ns(until_ns)))
             if clock.now_ns() < until_ns:
                 link.service()
-        clock.sleep_until_ns(min(arrival_ns, clock.now_ns() + PREPARE_NS, until_ns))
+        clock.sleep_until_ns(min(arrival_ns, transport.stop_ns(until_ns)))
         if clock.now_ns() < until_ns:
             yield
 
@@ -312,8 +313,11 @@ def _link(
 class _RecordedTransport(Transport):
     """Transport that delivers recorded packets and discards sent ones."""
 
-    def __init__(self, clock: SteppedClock, packets: Sequence[RecordedPacket]) -> None:
+    def __init__(
+        self, clock: SteppedClock, packets: Sequence[RecordedPacket], requested_ns: Sequence[int]
+    ) -> None:
         self._clock = clock
+        self._requested_ns = requested_ns
         self._packets = iter(packets)
         self._next = next(self._packets, None)
         self.sent_ns: int | None = None
@@ -335,6 +339,13 @@ class _RecordedTransport(Transport):
     def next_arrival_ns(self) -> int | None:
         """Arrival of the next packet; None after the last, and without a connection."""
         return None if self._next is None or self._is_down else self._next.arrived_ns
+
+    def stop_ns(self, until_ns: int) -> int:
+        """Return when to service the link next: a vehicle answers a request within milliseconds,
+        and one that is repeated late misses its answer."""
+        now_ns = self._clock.now_ns()
+        place = bisect_right(self._requested_ns, now_ns)
+        return min(now_ns + PREPARE_NS, until_ns, *self._requested_ns[place : place + 1])
 
     def drain(self) -> Iterator[Received]:
         """Yield every packet that has arrived."""

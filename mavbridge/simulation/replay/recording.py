@@ -39,6 +39,8 @@ STAMP_NS = 10 * NS_PER_MS
 and monotonic clock drift apart by less in an hour."""
 _PARAM_REQUEST_READ, _PARAM_ID = 20, slice(4, 20)
 """Message id, and position of the parameter's name in its payload."""
+_REQUESTS = (_PARAM_REQUEST_READ, 76)
+"""Message ids of requests to the vehicle; 76: COMMAND_LONG."""
 LOOK_AHEAD = 64
 """Table rows searched for a packet of the log, since the log may have lost some."""
 
@@ -70,6 +72,8 @@ class ReplaySource:
     """Packets in order of arrival."""
     known_params: frozenset[str]
     """Parameters that the flight had requested; a later version requests more."""
+    requested_ns: tuple[int, ...]
+    """When the guard's requests to the vehicle left, from the log."""
     gaps: tuple[str, ...]
     """Losses of the recording, in words; the replay may differ there."""
 
@@ -91,6 +95,7 @@ def open_source(folder: Path) -> ReplaySource:
     ticks, solves, solves_lost = _rows(folder, meta, damage)
     stamps = list(read_packets(read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)))
     log, skipped = read_tlog(folder / TLOG)
+    offset_ns = settings.wall_offset_ns
     if skipped:
         damage.append(
             f"{folder / TLOG} is damaged, or of another MAVLink dialect: {skipped} bytes were "
@@ -98,7 +103,8 @@ def open_source(folder: Path) -> ReplaySource:
         )
     system = flown.link.source_system
     received = [each for each in log if each[1].source.system != system]
-    packets = tuple(_packets(received, stamps, settings.wall_offset_ns))
+    sent = [each for each in log if each[1].source.system == system]
+    packets = tuple(_packets(received, stamps, offset_ns))
     features = _features(folder, meta, damage)
     lost = _lost(
         ticks=sum(row.dropped_before for row in ticks),
@@ -120,8 +126,13 @@ def open_source(folder: Path) -> ReplaySource:
         packets=packets,
         known_params=frozenset(
             packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
-            for _, packet in log
-            if packet.source.system == system and packet.message_id == _PARAM_REQUEST_READ
+            for _, packet in sent
+            if packet.message_id == _PARAM_REQUEST_READ
+        ),
+        requested_ns=tuple(
+            1000 * stamp_us - offset_ns
+            for stamp_us, packet in sent
+            if packet.message_id in _REQUESTS
         ),
         gaps=(*damage, *lost),
     )
