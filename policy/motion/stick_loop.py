@@ -156,6 +156,22 @@ class ThrustGain:
         return min(max(expected_mps2 / max(self._up_mps2, 1.0), least), most)
 
 
+def thrust_gains(hover_thrust: float, sent: FloatArray, state: FloatArray) -> FloatArray:
+    """Return the factor on thrusts at each of N decisions of a flight, float32 [N].
+
+    Args:
+        hover_thrust: hover thrust of training, in [0, 1].
+        sent: thrust sent at each decision [N]; the next decision measures with it.
+        state: state at each decision [N, state_dim]; NaN where none is known.
+    """
+    gain, values = ThrustGain(hover_thrust), []
+    for thrust, at in zip((hover_thrust, *sent[:-1].tolist()), state, strict=True):
+        if np.isfinite(at).all():
+            gain.update(thrust, at)
+        values.append(gain.value)
+    return np.array(values, np.float32)
+
+
 @dataclass(frozen=True, slots=True)
 class StickLoop:
     """Conversion of sticks to the thrust and body rates that fly them, and back.
@@ -221,7 +237,7 @@ class StickLoop:
     def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
         """Convert rates [N, 4] at states [N, state_dim] to the sticks [N, 4] behind them.
 
-        Motion beyond full stick is clipped.
+        Thrusts are those of the vehicle of training. Motion beyond full stick is clipped.
         """
         contract = self.contract
         attitude = np.stack(

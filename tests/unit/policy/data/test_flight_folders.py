@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
+from policy.contract import Contract
 from policy.data.flight_data import DatasetError, hold_out
 from policy.data.flight_folders import (
     failure_of,
@@ -208,6 +209,23 @@ def test_no_flights_are_refused(tmp_path: Path) -> None:
 
 def contract(**terms: object) -> dict[str, object]:
     return {"contract": {"state_frame": "ned_frd", **terms}}
+
+
+def test_by_rates_the_thrust_of_a_heavy_vehicle_is_not_imitated(tmp_path: Path) -> None:
+    """A policy's thrusts are scaled by the same factor in flight."""
+    count, moving = 600, (3.0, *LEVEL[1:])
+    thrust = (1.2 * Contract().hover_thrust, 0.0, 0.0, 0.0)
+    folder = flight(
+        tmp_path / "a",
+        contract(action="rates"),
+        woke_ns=[10 * MS * tick for tick in range(count)],
+        state=[None, *[moving] * (count - 1)],
+        expert=[thrust] * count,
+        sent=[None, *[thrust] * (count - 1)],
+    )
+    climb = read_flight(folder).target[:, 0]
+    assert climb[0] > 0.09
+    assert abs(climb[-1]) < 0.01
 
 
 @pytest.mark.parametrize(
