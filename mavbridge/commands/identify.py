@@ -15,7 +15,7 @@ from mavbridge.commands.output import make_table, table_console, write_json
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
-from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import empty_folders_removed, require_writable
 from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
@@ -24,7 +24,7 @@ from mavbridge.flight.checks import check_flight, output_folders
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import patient_console
-from policy.contract import RATE, ActionKind, Contract, FloatArray
+from policy.contract import RATE, STICK_TERMS, ActionKind, Contract, FloatArray
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.motion.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps, measure
 from policy.motion.scripted import ScriptedPolicy
@@ -355,15 +355,18 @@ def identify(config: IdentifyConfig) -> int:
         check_flight(flight)
         policy, runner = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
         plan = plan_flight(flight, runner.contract, is_dual=runner.dual_rate)
-        fly_policy(plan, runner, clock=clock, console=patient_console(), sinks=(recording,))
-    if policy.program_start_s is None:
-        raise PeerError("the flight ended before the doublet began: there is nothing to measure")
-    found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)
-    if not found.pushes:
-        raise PeerError(f"nothing could be measured: {'; '.join(found.missing)}")
-    print_identification(found, trained, table_console())
-    write_json(config.json, as_document(found, trained, config))
-    return 0
+        code = fly_policy(plan, runner, clock=clock, console=patient_console(), sinks=(recording,))
+    missing: tuple[str, ...] = ("the flight ended before the doublet began",)
+    if policy.program_start_s is not None:
+        found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)
+        if found.pushes:
+            print_identification(found, trained, table_console())
+            write_json(config.json, as_document(found, trained, config))
+            return code
+        missing = found.missing
+    error: MavbridgeError = PeerError(f"nothing could be measured: {'; '.join(missing)}")
+    error.exit_code = code or error.exit_code
+    raise error
 
 
 def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
@@ -384,10 +387,7 @@ def doublet_policy(
     trained: Contract, clock: Clock, *, is_in_air: bool
 ) -> tuple[ScriptedPolicy, PolicyRunner]:
     """Return the doublet in the policy's kind of action, with that policy's gains."""
-    names = (
-        *("hover_thrust", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps"),
-        *("full_descent_mps", "lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
-    )
+    names = ("hover_thrust", *STICK_TERMS[1:])
     policy = ScriptedPolicy(
         "doublet",
         lambda: clock.now_ns() / NS_PER_S,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from io import StringIO
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,16 +19,19 @@ from mavbridge.commands.identify import (
     as_document,
     doublet_flight,
     doublet_policy,
+    identify,
     identify_pushes,
     print_identification,
 )
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import ExitCode, PeerError
 from mavbridge.core.vehicle import ACTION_CLASSES
 from policy.contract import ActionKind, Contract
 from policy.motion.controllers import doublet_length_s, doublet_steps
 
+IDENTIFY = "mavbridge.commands.identify"
 START_S = 100.0
 STEP_S = 0.01
 LAG_S, DEAD_STEPS = 0.15, 8
@@ -202,3 +206,26 @@ def test_the_doublet_means_by_its_sticks_what_the_policy_means() -> None:
     assert runner.contract.yaw_dead_zone == 0.1
     assert runner.dual_rate
     assert policy.program_start_s is None
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_the_exit_status_is_that_of_the_flight_whatever_was_measured(
+    begins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown = recorded("sticks", usual_sticks)
+
+    def crash(*_args: object, sinks: tuple[object, ...], **_kwargs: object) -> int:
+        vars(sinks[0]).update(vars(flown))
+        return ExitCode.CRASHED
+
+    _, runner = doublet_policy(Contract(), FakeClock(), is_in_air=True)
+    policy = SimpleNamespace(program_start_s=START_S if begins else None)
+    monkeypatch.setattr(IDENTIFY + ".doublet_policy", lambda *_args, **_kwargs: (policy, runner))
+    monkeypatch.setattr(IDENTIFY + ".fly_policy", crash)
+    asked = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:1"))
+    if begins:
+        assert identify(IdentifyConfig(flight=asked)) == ExitCode.CRASHED
+    else:
+        with pytest.raises(PeerError, match="ended before the doublet") as told:
+            identify(IdentifyConfig(flight=asked))
+        assert told.value.exit_code == ExitCode.CRASHED
