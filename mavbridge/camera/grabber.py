@@ -1,5 +1,6 @@
 """Timeouts of live sources, and the thread that keeps a blocking source drained."""
 
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
@@ -14,6 +15,8 @@ STALL_NS = 2 * NS_PER_S
 """Limit for all other frames."""
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
 JOIN_S = 3.0
+
+_log = logging.getLogger(__name__)
 
 
 def wait_until_due(clock: Clock, due_ns: int, timeout_ns: int) -> bool:
@@ -126,6 +129,9 @@ class Grabber:
             if delay_s is None:
                 attempts = len(self._reopen_delays_s)
                 return CameraError(f"{reason}; {attempts} attempts to reopen it have failed")
+            if self._frame_count > frames_before and not self._stopping.is_set():
+                # A reader sees only that no frame comes.
+                _log.warning("%s; the camera is opened again", reason)
             if self._stopping.wait(delay_s):
                 return CameraError("the camera has been closed")
 

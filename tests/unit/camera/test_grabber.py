@@ -133,6 +133,15 @@ def test_a_lost_source_is_closed_and_opened_again_and_a_frame_gives_all_attempts
         assert grabber.read(WAIT_NS).frame_id == frame_id
 
 
+def test_why_a_camera_is_opened_again_is_told_once(source, grab, caplog):
+    other = ScriptedSource()
+    grabber = grab(source, CameraError("still gone"), other, delays_s=(0.0, 0.0))
+    source.script.put(UNPLUGGED)
+    other.put(START_NS + 2)
+    grabber.close()
+    assert caplog.messages == ["unplugged; the camera is opened again"]
+
+
 @pytest.mark.parametrize("attempt", [lambda error: error, ScriptedSource])
 def test_when_all_attempts_fail_it_is_dead_with_the_last_reason(source, grab, attempt):
     """Sources that open but deliver nothing use up the attempts."""
