@@ -197,7 +197,8 @@ class MavlinkLink:
             self._counters.receive(f"{message.name} (invalid)", message, arrived_ns)
             vehicle.receive(message, arrived_ns)
             return
-        self._counters.receive(message.name, message, arrived_ns)
+        name = f"{message.name} (invalid)" if message.is_unusable else message.name
+        self._counters.receive(name, message, arrived_ns)
         if isinstance(body, Measurement):
             happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
             self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)

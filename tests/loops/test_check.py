@@ -12,6 +12,8 @@ from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.flight.plan import plan_flight
+from mavbridge.mavlink.codec.messages import Body
+from mavbridge.mavlink.codec.readers import READERS, UnusableError
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address
 from mavbridge.simulation.clock import SteppedClock
@@ -102,6 +104,20 @@ def test_an_ardupilot_that_is_set_up_is_a_go() -> None:
     assert rows["clocks (TIMESYNC)"].verdict == "go"
     for name in ("attitude", "velocity", "acceleration"):
         assert float(rows[name].found.split()[0]) == pytest.approx(100, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("message", "name"), [("LOCAL_POSITION_NED", "velocity"), ("HIGHRES_IMU", "acceleration")]
+)
+def test_values_that_no_flight_would_use_do_not_count_as_telemetry(
+    message: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(_fields: object) -> Body:
+        raise UnusableError  # as of NaN
+
+    monkeypatch.setitem(READERS, message, read)
+    rows = Bench("px4").check(contract=Contract())
+    assert (rows[name].found, rows[name].verdict) == ("0.0 Hz", "no-go")
 
 
 @pytest.mark.parametrize("receiver_us", [MID_RECEIVER_US, None])

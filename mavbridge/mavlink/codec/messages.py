@@ -283,6 +283,8 @@ class ReceivedMessage(NamedTuple):
     body: Body | None
     """None: the bridge does not use the message, or its values are unusable."""
     packet: bytes
+    is_unusable: bool = False
+    """True if its values are, such as NaN."""
 
 
 class CommandRequest(NamedTuple):

@@ -172,13 +172,14 @@ class Codec:
             self.hears_signed = self.hears_signed or frame.flags == SIGNED
         elif not self.signing.accepts(frame):
             return None
-        body, layout = None, LAYOUTS.get(frame.message_id)
+        body, layout, is_unusable = None, LAYOUTS.get(frame.message_id), False
         try:
             body = None if layout is None else layout.read(frame.payload)
         except UnusableError:
+            is_unusable = True
             self.bad_data_count += 1
         name = NAMES.get(frame.message_id, UNKNOWN)
-        return ReceivedMessage(frame.source, frame.sequence, name, body, frame.data)
+        return ReceivedMessage(frame.source, frame.sequence, name, body, frame.data, is_unusable)
 
     def _pack(self, kind: type[dialect.MAVLink_message], *values: float | bytes) -> bytes:
         """Encode a message from its fields in the order of the wire, and sign it if there is a key.
