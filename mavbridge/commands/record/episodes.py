@@ -1,9 +1,11 @@
 """Start and end of episodes, their folders, recorders and marks, and the room on the disk."""
 
 import os
+import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from shutil import disk_usage
 from typing import Literal, TypeAlias
@@ -14,7 +16,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
-from mavbridge.recording.recorder import Recorder
+from mavbridge.recording.recorder import CAPACITY, IMAGE_CAPACITY, Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 
 QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
@@ -175,6 +177,10 @@ class Episodes:
         self._autopilot = autopilot
         self._wall_offset_ns = wall_offset_ns
         self._report = report
+        self._early: dict[type[Event], list[Event]] | None = None
+        """Events that came while the writer of an episode starts, which takes seconds."""
+        self._lock = threading.Lock()
+        """Keeps events in order when the writer is there."""
         self.current: Episode | None = None
         self._last: Episode | None = None
         self._marks: dict[int, bool | None] = {}
@@ -182,9 +188,13 @@ class Episodes:
 
     def emit(self, event: Event) -> None:
         """Record the event if an episode is in progress; a ``TickSink``."""
-        current = self.current
-        if current is not None:
-            current.emit(event)
+        with self._lock:
+            if self._early is not None:
+                early = self._early.setdefault(type(event), [])
+                if len(early) < (CAPACITY if isinstance(event, Tick) else IMAGE_CAPACITY):
+                    early.append(event)  # later ones are missed by their numbers
+            elif self.current is not None:
+                self.current.emit(event)
 
     @property
     def number(self) -> int:
@@ -204,7 +214,7 @@ class Episodes:
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder, "--out")
-        begin_ns = self._clock.now_ns()
+        begin_ns, self._early = self._clock.now_ns(), {}
         try:
             pipe = open_tlog_pipe()
             log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=self._wall_offset_ns)
@@ -220,9 +230,13 @@ class Episodes:
         except OSError as error:
             raise UserError(f"{folder}: {error}") from error
         self._log_to(log)
-        self.current = Episode(
+        episode = Episode(
             folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
         )
+        with self._lock:
+            for event in chain.from_iterable(self._early.values()):
+                episode.emit(event)
+            self._early, self.current = None, episode
         self._next += 1
 
     def end(self, reason: str) -> None:

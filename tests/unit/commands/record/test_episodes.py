@@ -15,6 +15,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.video_writer import WriterDiedError
 
 PACKET = bytes(20)
@@ -88,6 +89,25 @@ def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
     stand.episodes.emit(make_frame(4, captured_ns=begin_ns))
     stand.episodes.end("a key")
     assert (stand.flight(1).meta.ticks, stand.flight(1).meta.frames) == (1, 1)
+
+
+def test_what_comes_while_the_writer_starts_is_recorded(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(*args: object, **kwargs: object) -> Recorder:
+        for number in range(100, 140):
+            stand.episodes.emit(make_tick(number))
+            stand.episodes.emit(make_frame(number))
+        return Recorder(*args, **kwargs)
+
+    monkeypatch.setattr(episodes, "Recorder", start)
+    stand.episodes.begin()
+    stand.episodes.emit(make_tick(140))
+    stand.episodes.emit(make_frame(140))
+    stand.episodes.end("a key")
+    flight = stand.flight(1)
+    assert [row.tick.index for row in flight.tick_rows()] == list(range(100, 141))
+    assert next(flight.frame_rows()).frame_id == make_frame(100).frame_id
 
 
 @pytest.mark.parametrize(("mark", "success"), [("good", True), ("bad", False)])
