@@ -333,9 +333,6 @@ def with_config(
         log_file: Append output, details and times to this file.
     """
     _check_command(tokens)
-    if print_config:
-        print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli)
-        return 0
     words = with_settings(tokens, set_config)
     cli.config = []
     if config is not None:
@@ -356,6 +353,11 @@ def with_config(
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
         cli.config = [Settings(document, source=str(config))]
+    if print_config:
+        asks = config is not None or any(word.startswith("-") for word in words)
+        asked = list(cli.parse_args(words)[1].arguments.values())[-1] if asks else None
+        print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli, asked)
+        return 0
     with run_log(log_file, verbose=verbose):
         status: int | None = cli(words)
     return status or 0

@@ -5,6 +5,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -144,8 +145,11 @@ def with_home(value: Any) -> Any:
     return value
 
 
-def print_settings(command: App) -> None:
-    """Print TOML that ``--config`` reads. Settings without a default are commented out."""
+def print_settings(command: App, asked: object = None) -> None:
+    """Print TOML that ``--config`` reads. Settings without a value are commented out.
+
+    ``asked`` is what the command line asks the command for; None: its defaults.
+    """
     sections: dict[str, list[str]] = {"": ["# Flags"]}
     for argument in command.assemble_argument_collection(parse_docstring=True):
         if argument.name == "*" or argument.children or not argument.name.startswith("--"):
@@ -153,7 +157,8 @@ def print_settings(command: App) -> None:
         section, _, key = argument.name.removeprefix("--").rpartition(".")
         help_text = " ".join(str(argument.parameter.help or "").split())
         lines = textwrap.wrap(help_text, 96, initial_indent="# ", subsequent_indent="# ")
-        value = _toml(argument.field_info.default)
+        default = argument.field_info.default
+        value = _toml(default if asked is None else reduce(getattr, argument.keys, asked))
         name = key.replace("-", "_")
         lines.append(f"# {name} =" if value is None else f"{name} = {value}")
         sections.setdefault(section, [f"[{section}]"]).extend(lines)

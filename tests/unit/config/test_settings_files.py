@@ -40,6 +40,17 @@ def test_the_printed_file_may_be_read_by_its_command(
     assert list(untrusted_settings(read_toml(path), [])) == []
 
 
+def test_what_the_command_line_asks_for_is_printed_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = (*VEHICLE, "--arm", "--camera=a=none", "--set-config", "envelope.height=20")
+    first, path = tmp_path / "first.toml", tmp_path / "all.toml"
+    first.write_text("[limits]\nslew = 3\n")
+    assert status_of(*asked, "--config", first, "--print-config") == 0
+    path.write_text(capsys.readouterr().out)
+    assert asked_flight("--config", path) == asked_flight(*asked, "--config", first)
+
+
 def test_a_section_whose_keys_are_all_commented_out_asks_for_nothing(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text("[limits]\n# slew = 3\n[network]\n")
