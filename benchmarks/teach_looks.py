@@ -50,8 +50,9 @@ app = App(help=__doc__)
 
 FIRST_SEED = 600_000
 """Of the flights: neither demonstrations nor evaluations have these courses."""
-FLIGHT_S = 35.0
-VIEWS, VIEWS_OF_A_LOOK = 1000, 100
+FLIGHT_S, RUN_OUT_S = 35.0, 5.0
+"""Longest flight, and time flown on after the last gate: views without a gate hold the place."""
+VIEWS, VIEWS_OF_A_LOOK = 2000, 80
 """Moments drawn of each flight, and how many of them in one look."""
 CAPACITY = 160_000
 """Moments kept, each with two views; the oldest are replaced."""
@@ -114,7 +115,9 @@ def fly(seed: int, weights: Path, *, by_rates: bool) -> tuple[Course, list[Viewp
             return runner.act(feature, state, history)
 
         logged = replace(runner, encode=encode, act=act)
-        flight.fly(logged, max_time_s=FLIGHT_S, sinks=(frames,))
+        flight.fly(
+            logged, max_time_s=FLIGHT_S, run_out_s=RUN_OUT_S, ends_by_stop=False, sinks=(frames,)
+        )
     known = {place: bodies[frame] for place, frame in enumerate(frames.ids)}
     return flight.course, [
         Viewpoint(known[at], *found) for at, found in solves.items() if at in known
@@ -233,7 +236,7 @@ def loss_of(net: Toge, batch: list[Tensor]) -> Tensor:
     of_feature = ((seen - feature) / feature.std(0).mean()).square().mean(1)
     of_chunk = ((chunk(seen) - wanted) / wanted.std((0, 1))).square().mean((1, 2))
     # Roots: views that show no gate at all must not outweigh the others.
-    loss: Tensor = 0.3 * (of_feature + 3e-3).sqrt().mean() + (of_chunk + 1e-3).sqrt().mean()
+    loss: Tensor = 0.3 * (of_feature + 1e-3).sqrt().mean() + (of_chunk + 1e-4).sqrt().mean()
     return loss
 
 
@@ -245,17 +248,26 @@ def load_toge(path: Path) -> Toge:
 
 
 @app.default
-def main(before: Path, *, out: Path, minutes: float, workers: int = 1) -> None:
+def main(
+    before: Path,
+    *,
+    out: Path,
+    minutes: float,
+    workers: int = 1,
+    teacher: Path | None = None,
+) -> None:
     """Teach the encoder of weights for ``toge`` or ``toge-rates``.
 
     Args:
-        before: weights to start from; what they compute for the nominal look is taught.
+        before: weights to start from.
         out: the weights, packed; written at the end.
         minutes: time to train; the learning rate falls with it.
         workers: flights at a time, beside the training.
+        teacher: weights with the same head; what they compute for the nominal look is taught.
+            Default: ``before``.
     """
     clock, random = MonotonicClock(), np.random.default_rng(FIRST_SEED)
-    net, average, kept = load_toge(before), load_toge(before), Kept(load_toge(before))
+    net, average, kept = load_toge(before), load_toge(before), Kept(load_toge(teacher or before))
     newest = out.with_suffix(".newest.safetensors")
     save_checkpoint(newest, average)
     net.train().requires_grad_(False)

@@ -32,7 +32,7 @@ NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, LOOPS, PX4 = "--action rates --courses race", "--courses loop", "--autopilot px4"
 STICKS, END = "--include-failed --ages 10:220", "--include-failed --ages 10:140 --only-end"
 
-LOOK_MINUTES = 120
+LOOK_MINUTES = 250
 BEFORE = "438fb84af6f14453cf773d90c24cdd1e15b7b50a"
 """Commit of 2026-11-27 with the weights to start from."""
 
