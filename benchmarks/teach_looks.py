@@ -4,8 +4,8 @@ python -m benchmarks.teach_looks before.safetensors --minutes 120 --out after.sa
 
 The policy flies courses of other looks, with the newest weights. Each moment of these flights is
 then drawn twice: in the nominal look, and in one of those that demonstrations have. From both
-views, also disturbed, the encoder learns to give the feature that the weights to start from give
-for the nominal view, and to cause the same chunk. The head keeps its weights.
+views, also disturbed, the encoder learns to give the feature that its teacher gives for the nominal
+view, and to cause the same chunk. The head keeps its weights.
 """
 
 import math

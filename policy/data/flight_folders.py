@@ -24,7 +24,7 @@ from policy.data.flight_video import decode_video, with_images
 from policy.data.tables import number_column, read_rows, retyped, stamps, vectors
 from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
-from policy.motion.stick_loop import StickLoop, rates_contract, thrust_gains
+from policy.motion.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
 
@@ -199,9 +199,8 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     if contract.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(contract))
-        thrust = np.nan_to_num(vectors(name, ticks, "sent", ACTION_DIM)[:, 0])
-        target[:, 0] /= thrust_gains(contract.hover_thrust, thrust, state)
-        target[is_target] = loop.to_sticks(target[is_target], state[is_target])
+        gains = loop.thrust_gains(vectors(name, ticks, "sent", ACTION_DIM)[:, 0], state)
+        target[is_target] = loop.to_sticks(target[is_target], state[is_target], gains[is_target])
     state[~is_target] = np.nan
     return FlightData(
         name=name,

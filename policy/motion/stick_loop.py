@@ -156,22 +156,6 @@ class ThrustGain:
         return min(max(expected_mps2 / max(self._up_mps2, 1.0), least), most)
 
 
-def thrust_gains(hover_thrust: float, sent: FloatArray, state: FloatArray) -> FloatArray:
-    """Return the factor on thrusts at each of N decisions of a flight, float32 [N].
-
-    Args:
-        hover_thrust: hover thrust of training, in [0, 1].
-        sent: thrust sent at each decision [N]; the next decision measures with it.
-        state: state at each decision [N, state_dim]; NaN where none is known.
-    """
-    gain, values = ThrustGain(hover_thrust), []
-    for thrust, at in zip((hover_thrust, *sent[:-1].tolist()), state, strict=True):
-        if np.isfinite(at).all():
-            gain.update(thrust, at)
-        values.append(gain.value)
-    return np.array(values, np.float32)
-
-
 @dataclass(frozen=True, slots=True)
 class StickLoop:
     """Conversion of sticks to the thrust and body rates that fly them, and back.
@@ -234,10 +218,27 @@ class StickLoop:
         )
         return up_mps2, max(down_body[2], MIN_COS_TILT), rate
 
-    def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
+    def thrust_gains(self, sent: FloatArray, state: FloatArray) -> FloatArray:
+        """Return the factor on thrusts at each of N decisions of a flight, float32 [N].
+
+        Args:
+            sent: thrust sent at each decision [N], which the next one measures with; NaN: none.
+            state: state at each decision [N, state_dim]; NaN where none is known.
+        """
+        gain, values = ThrustGain(self.contract.hover_thrust), []
+        before = (self.contract.hover_thrust, *np.nan_to_num(sent[:-1]).tolist())
+        for thrust, at in zip(before, state, strict=True):
+            if np.isfinite(at).all():
+                gain.update(thrust, at)
+            values.append(gain.value)
+        return np.array(values, np.float32)
+
+    def to_sticks(
+        self, rates: FloatArray, state: FloatArray, thrust_gain: FloatArray | float = 1.0
+    ) -> FloatArray:
         """Convert rates [N, 4] at states [N, state_dim] to the sticks [N, 4] behind them.
 
-        Thrusts are those of the vehicle of training. Motion beyond full stick is clipped.
+        ``thrust_gain`` is the factor on their thrusts [N]. Motion beyond full stick is clipped.
         """
         contract = self.contract
         attitude = np.stack(
@@ -245,7 +246,8 @@ class StickLoop:
         ).astype(np.float64)
         down_body = rotate(conjugate(attitude), np.tile([0.0, 0.0, 1.0], (len(rates), 1)))
         cos_tilt = np.maximum(down_body[:, 2], MIN_COS_TILT)
-        up_mps2 = rates[:, 0] / contract.hover_thrust * GRAVITY_MPS2 * cos_tilt
+        hover_thrust = thrust_gain * contract.hover_thrust
+        up_mps2 = rates[:, 0] / hover_thrust * GRAVITY_MPS2 * cos_tilt
         climb_mps = -state[:, VELOCITY.stop - 1] + (up_mps2 - GRAVITY_MPS2) / CLIMB_GAIN_PER_S
         yaw_rate = rates[:, 3] / cos_tilt
         tilt_p = rates[:, 1] - yaw_rate * down_body[:, 0]
