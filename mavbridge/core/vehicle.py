@@ -391,8 +391,5 @@ class LinkStats:
     """True: ages count from the vehicle's stamps. False: from arrival, which hides latency."""
     slow_clock: str | None = None
     """By how much the vehicle's clock lags real time, in words; None: it does not."""
-    saturated: tuple[tuple[str, float], ...] = ()
-    """By stick, share of the messages in which the policy asked for more than the vehicle can do;
-    zeros left out."""
     timesync_error_ms: float | None = None
     """Upper bound of the error of the clocks' offset, and so of every age."""

@@ -237,7 +237,6 @@ class MavlinkLink:
         counters, timesync, output = self._counters, self._timesync, self._sender.output
         sent, slow_clock = counters.sent, timesync.slow_clock
         error_ns = timesync.error_ns(counters.heard_ns)
-        saturated = sorted(output.saturated.items()) if sent and output is not None else ()
         return LinkStats(
             messages_per_s=counters.messages_per_s,
             lost_fraction=counters.lost_fraction,
@@ -246,7 +245,6 @@ class MavlinkLink:
             echo_confirmed=output.was_confirmed if sent and output is not None else None,
             unusable_packets=self._codec.bad_data_count,
             refused_signatures=self._codec.refused_signatures,
-            saturated=tuple((name, count / sent) for name, count in saturated),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
             slow_clock=None if slow_clock is None else str(slow_clock),

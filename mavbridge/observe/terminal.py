@@ -324,11 +324,7 @@ def _link_text(link: LinkStats) -> str:
         else f"{shown_share(link.lost_fraction, 2)} of the vehicle's messages lost"
     )
     sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
-    limits = "".join(
-        f", {stick} beyond what the vehicle does in {shown_share(share, 1)}"
-        for stick, share in link.saturated
-    )
-    return f"{sent}, {echo[link.echo_confirmed]}, {lost}{limits}"
+    return f"{sent}, {echo[link.echo_confirmed]}, {lost}"
 
 
 def _release_text(report: TimingReport) -> str:

@@ -365,6 +365,5 @@ def report_document(report: TimingReport) -> dict[str, object]:
     """Return the report for ``as_json``, with keys in the order of the dataclasses."""
     document = {field.name: getattr(report, field.name) for field in fields(report)}
     if (link := report.link) is not None:
-        pairs = {"messages_per_s": dict(link.messages_per_s), "saturated": dict(link.saturated)}
-        document["link"] = asdict(link) | pairs
+        document["link"] = asdict(link) | {"messages_per_s": dict(link.messages_per_s)}
     return document

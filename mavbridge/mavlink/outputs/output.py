@@ -1,7 +1,6 @@
 """Interface of an output: encodes actions, and checks their echo."""
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from typing import ClassVar, NamedTuple
 
 from mavbridge.core.reasons import Code, Reason, because
@@ -20,8 +19,6 @@ class Encoded(NamedTuple):
     """Action as the packet expresses it, in the policy's terms."""
     shown: Shown | None
     """Expected echo; None: nothing to check."""
-    saturated: tuple[str, ...] = ()
-    """Sticks that demand more than the vehicle can do."""
 
 
 class ActionOutput(ABC):
@@ -43,8 +40,6 @@ class ActionOutput(ABC):
         self._codec = codec
         self._rules = rules
         self.echo = EchoCheck(rules)
-        self.saturated: Counter[str] = Counter()
-        """Number of messages, by stick, that demanded more than the vehicle can do."""
         self.was_confirmed = False
         """True if the vehicle has ever been seen to act on our packets."""
         self._is_checked = True
@@ -60,7 +55,6 @@ class ActionOutput(ABC):
 
     def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note an action that was sent."""
-        self.saturated.update(encoded.saturated)
         if encoded.shown is not None:
             self.echo.sent(encoded.shown, now_ns)
 

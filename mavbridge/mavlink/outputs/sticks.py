@@ -64,18 +64,18 @@ class StickOutput(ActionOutput):
 
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
-    ) -> tuple[Sticks, StickCurves, tuple[str, ...]]:
-        """Return the vehicle's sticks, the curves for the inverse, and the saturated sticks.
+    ) -> tuple[Sticks, StickCurves]:
+        """Return the vehicle's sticks, and the curves for the inverse.
 
         ``IDLE`` is not mapped: it means the stop at the bottom, for arming.
         """
         if not isinstance(action, Sticks):
             raise CommandRefusedError(f"{type(action).__name__} are not sticks")
         if action is IDLE:
-            return action, IDENTITY, ()
+            return action, IDENTITY
         status = vehicle.status(now_ns)
         curves = self._curves_of(vehicle, status.mode if status else "", now_ns)
-        return curves.to_vehicle(action), curves, curves.saturated(action)
+        return curves.to_vehicle(action), curves
 
     def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:
         if mode != self._curves_mode or now_ns >= self._curves_due_ns:
@@ -117,14 +117,14 @@ class OverrideOutput(StickOutput):
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the override of the four sticks; return None without a calibration."""
-        sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
+        sticks, curves = self._wanted(action, vehicle, now_ns)
         calibration = vehicle.params.calibration
         if calibration is None:
             return None
         pwm_us = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         self._calibration, self._last = calibration, pwm_us
-        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), pwm_us, saturated)
+        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), pwm_us)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare RC_CHANNELS, which shows our sticks in place of the receiver's."""
@@ -226,11 +226,11 @@ class ManualControlOutput(StickOutput):
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the four sticks, rounded."""
-        sticks, curves, saturated = self._wanted(action, vehicle, now_ns)
+        sticks, curves = self._wanted(action, vehicle, now_ns)
         shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
         values = ManualControl._make(shown)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
-        return Encoded(packet, curves.to_policy(values.sticks), shown, saturated)
+        return Encoded(packet, curves.to_policy(values.sticks), shown)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the sticks that the vehicle acts on; they have no timestamp of the vehicle."""

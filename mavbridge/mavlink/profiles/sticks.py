@@ -20,7 +20,7 @@ SAME_END = 0.1
 throttle has one at the bottom (RC3_DZ, 0.06 by default), also for the policies trained on it."""
 MAX_DEAD_ZONE = 0.9
 _ROUNDING = 1e-9
-"""Tolerance for rounding of a motion at the limit."""
+"""Tolerance for rounding of a difference at the limit."""
 
 
 class Bend(Protocol):
@@ -93,11 +93,6 @@ class Axis(NamedTuple):
         """Return the stick for a motion."""
         return self.above.travel(motion) if motion >= 0.0 else -self.below.travel(-motion)
 
-    def reaches(self, motion: float) -> bool:
-        """True if the motion is within the axis."""
-        half = self.above if motion >= 0.0 else self.below
-        return abs(motion) <= half.full * (1.0 + _ROUNDING)
-
     def is_like(self, policy: "Axis") -> bool:
         """True if both halves are close to the policy's."""
         return self.above.is_like(policy.above) and self.below.is_like(policy.below)
@@ -136,15 +131,12 @@ class Lean(NamedTuple):
             return math.degrees(math.atan(pitch)), math.degrees(math.atan(roll))
         return pitch, roll
 
-    def in_own_unit(self, pitch_deg: float, roll_deg: float) -> tuple[float, float]:
-        """Return leans in the unit of ``full``."""
-        if self.is_tangent:
-            return math.tan(math.radians(pitch_deg)), math.tan(math.radians(roll_deg))
-        return pitch_deg, roll_deg
-
     def sticks(self, pitch_deg: float, roll_deg: float) -> tuple[float, float]:
         """Return the sticks for these leans."""
-        pitch, roll = _within(self.full, *self.in_own_unit(pitch_deg, roll_deg))
+        pitch, roll = pitch_deg, roll_deg
+        if self.is_tangent:
+            pitch, roll = math.tan(math.radians(pitch_deg)), math.tan(math.radians(roll_deg))
+        pitch, roll = _within(self.full, pitch, roll)
         return self.pitch.stick(pitch), self.roll.stick(roll)
 
 
@@ -233,21 +225,6 @@ class StickCurves:
             leaning, leant = self.lean[::order]
             pitch, roll = leant.sticks(*leaning.motion_deg(pitch, roll))
         return Sticks(throttle=throttle, yaw=yaw, pitch=pitch, roll=roll)
-
-    def saturated(self, sticks: Sticks) -> tuple[str, ...]:
-        """Return the names of sticks that demand more than the vehicle can do, in Sticks' order."""
-        throttle, yaw, pitch, roll = sticks
-        names: tuple[str, ...] = ()
-        for name, stick, axes in (("throttle", throttle, self.throttle), ("yaw", yaw, self.yaw)):
-            if axes is not None and not axes[1].reaches(axes[0].motion(stick)):
-                names += (name,)
-        if self.lean is not None:
-            policy, vehicle = self.lean
-            asked = vehicle.in_own_unit(*policy.motion_deg(pitch, roll))
-            if math.hypot(*asked) > vehicle.full * (1.0 + _ROUNDING):
-                names += ("pitch",) if policy.pitch.motion(pitch) else ()
-                names += ("roll",) if policy.roll.motion(roll) else ()
-        return names
 
 
 IDENTITY = StickCurves()

@@ -41,11 +41,6 @@ def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
         ({"echo_confirmed": False, "lost_fraction": 0.5}, "NO ECHO from the vehicle, 50.00% of"),
         ({"echo_confirmed": None, "lost_fraction": None}, "echo not checked, loss not measured"),
         ({"lost_fraction": 2 / 60_000}, "echo confirmed, under 0.01% of the"),
-        (
-            {"saturated": (("roll", 25 / 60_000),)},
-            "the vehicle does in under 0.1%",
-        ),
-        ({"saturated": (("pitch", 0.123),)}, "lost, pitch beyond what the vehicle does in 12.3%"),
     ],
 )
 def test_the_link_verdict_is_honest(link: dict[str, Any], expected: str) -> None:

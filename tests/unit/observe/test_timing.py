@@ -27,7 +27,6 @@ LINK = LinkStats(
     rtt_ms=None,
     sent_overrides=6000,
     echo_confirmed=True,
-    saturated=(("yaw", 0.01),),
 )
 
 
@@ -156,7 +155,6 @@ def test_the_json_holds_the_report_with_links_and_reasons_of_releases() -> None:
     assert list(document) == [each.name for each in fields(report)]
     assert document["sticks"] == asdict(report.sticks)
     assert document["feature_age_ms"] == dict.fromkeys(("p50", "p99", "p999", "max"), 40.0)
-    assert document["link"]["saturated"] == {"yaw": 0.01}
     assert document["link"]["messages_per_s"] == {"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0}
     assert document["releases"] == [{"t_s": 0.0, "reason": reason_to_json(NO_IMAGE)}]
     assert document["observer_drops"] == {"rerun": None, "recorder": None}
