@@ -335,7 +335,7 @@ class MavlinkLink:
             self.vehicle.watch_home_height()
         self._sender.equip(self.vehicle)
         self._telemetry = TelemetryCollector()
-        self._timesync.restart()
+        self._timesync = TimesyncFilter(self._report)
         self.commands.adopt(self.vehicle)
         self._counters.new_sequence()
         self._duplicate_systems = DuplicateSystems()

@@ -56,7 +56,7 @@ class _Exchange(NamedTuple):
 
 
 class TimesyncFilter:
-    """Estimates the offset from the most accurate exchange.
+    """Estimates the offset from the most accurate exchange with one session of a vehicle.
 
     A request and its answer that together take t give the offset within t / 2, however t is split
     between the directions. So the fastest exchange is kept, however old, until possible clock drift
@@ -87,14 +87,6 @@ class TimesyncFilter:
         self._trusted_ns: int | None = None
         """Last request with a good offset, or else the first one; None before it."""
         self._has_told = False
-
-    def restart(self) -> None:
-        """Forget the offset after a reboot or a change of vehicle."""
-        self._outstanding.clear()
-        self._sending_ns.clear()
-        self._clocks.clear()
-        self._least_ns.clear()
-        self._best, self._agreeing, self._trusted_ns = None, 0, None
 
     def request(self, now_ns: int, early_ns: int = 0) -> int | None:
         """Return the ts1 of the request that is due now or within ``early_ns``, else None."""
