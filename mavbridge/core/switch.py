@@ -5,7 +5,8 @@ from typing import Literal, TypeAlias
 from mavbridge.core.clock import NS_PER_MS
 
 RADIO_US = range(800, 2201)
-"""Readings of a radio. Any other number (0, 65535) is an undriven channel."""
+"""PWM range of a radio. No other value is sent, even if the vehicle's calibration demands it; as a
+reading (0, 65535) it is an undriven channel."""
 ON_US, OFF_US = 1800, 1200
 """ArduPilot's thresholds of a high and a low switch."""
 DWELL_NS = 200 * NS_PER_MS

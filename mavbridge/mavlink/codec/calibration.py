@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from mavbridge.core.switch import RADIO_US
 from mavbridge.core.vehicle import Sticks
 
 Pwm: TypeAlias = tuple[int, ...]
@@ -11,9 +12,6 @@ Pwm: TypeAlias = tuple[int, ...]
 
 PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
 """ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others increase PWM."""
-
-PWM_LIMITS_US = (800, 2200)
-"""PWM range of a radio. No other value is sent, even if the vehicle's calibration demands it."""
 
 FS_THR_MARGIN_US = 10
 """Margin of RC3_MIN above FS_THR_VALUE that ArduPilot's arming check demands."""
@@ -32,11 +30,9 @@ class RcChannel:
 
     def __post_init__(self) -> None:
         """Raise ValueError if the calibration cannot map sticks."""
-        if not 1 <= self.number <= 8:
-            raise ValueError(f"channel {self.number} is not one of 1..8")
-        low_us, high_us = PWM_LIMITS_US
+        low_us, high_us = RADIO_US[0], RADIO_US[-1]
         for part, value_us in (("MIN", self.min_us), ("MAX", self.max_us)):
-            if not low_us <= value_us <= high_us:
+            if value_us not in RADIO_US:
                 name, nearest_us = f"RC{self.number}_{part}", min(max(value_us, low_us), high_us)
                 raise ValueError(
                     f"{name} {value_us} is not in {low_us}..{high_us} us: calibrate the radio, or "

@@ -11,8 +11,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
+from mavbridge.core.switch import RADIO_US
 from mavbridge.core.vehicle import Sticks, Velocity
-from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
+from mavbridge.mavlink.codec.calibration import Pwm, RcCalibration
 from mavbridge.mavlink.codec.frames import (
     HEADER,
     MARKER,
@@ -215,7 +216,7 @@ class Codec:
         for channel, value_us in zip(
             calibration.channels, pwm_us or (_RELEASE_US,) * 4, strict=True
         ):
-            if pwm_us and not PWM_LIMITS_US[0] <= value_us <= PWM_LIMITS_US[1]:
+            if pwm_us and value_us not in RADIO_US:
                 raise CommandRefusedError(f"{value_us} us on channel {channel.number}")
             channels_us[channel.number - 1] = value_us
         if pwm_us and pwm_us[0] < calibration.throttle_floor_us:

@@ -157,17 +157,12 @@ class VehicleDiscovery:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
             return f"{silent}, but system {heard} was heard: correct link.target_system"
-        if any(source.system == 0 for source in self._odd_ids):
-            return (
-                "an autopilot was heard as system 0, which means all systems: set MAV_SYSID, "
-                "SYSID_THISMAV or MAV_SYS_ID (PX4) to another"
-            )
         if self._odd_ids:
-            found = ", ".join(map(str, sorted(source.component for source in self._odd_ids)))
+            found = " and ".join(f"{s.system}, component {s.component}" for s in self._odd_ids)
             return (
-                f"an autopilot was heard as component {found}, and component "
-                f"{AUTOPILOT_COMPONENT} is flown: set MAV_COMP_ID (PX4) to {AUTOPILOT_COMPONENT}, "
-                "or mend the router that changes it"
+                f"an autopilot was heard as system {found}, and component {AUTOPILOT_COMPONENT} of "
+                "another system than 0 is flown: set MAV_SYSID, SYSID_THISMAV or MAV_SYS_ID and "
+                "MAV_COMP_ID (PX4), or mend the router that changes it"
             )
         if refused := connection.obstacles(now_ns):
             return "; ".join(refused)
@@ -203,24 +198,20 @@ class VehicleDiscovery:
 def _silence(address: LinkAddress, amount: str | None) -> str:
     """Explain why no MAVLink was heard; ``amount``: the bytes received instead, in words."""
     match address:
-        case SerialAddress(baud=baud) if amount:
-            return (
-                f"{amount}, and no MAVLink in it: another baud rate than {baud}, or another "
-                "protocol on the vehicle's port (SERIALn_PROTOCOL 2 on ArduPilot, MAV_n_CONFIG "
-                "on PX4)"
-            )
         case SerialAddress(baud=baud):
+            heard = (
+                f"the port is silent at {baud} baud: is the vehicle powered, are TX and RX crossed"
+            )
+            if amount:
+                heard = f"{amount}, and no MAVLink in it: is {baud} the vehicle's baud rate"
             return (
-                f"the port is silent at {baud} baud: is the vehicle powered, are TX and RX "
-                "crossed, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
+                f"{heard}, and is MAVLink on that port (SERIALn_PROTOCOL 2 on ArduPilot, "
                 "MAV_n_CONFIG on PX4)?"
             )
-        case UdpAddress(listens=True) if amount:
-            return f"{amount}, and no MAVLink in it: another program sends to this port"
         case _ if amount:
             return (
-                f"{amount}, and no MAVLink in it: another service is at this address, or a bridge "
-                "to a serial port with another baud rate or protocol"
+                f"{amount}, and no MAVLink in it: another program or service is at this address, "
+                "or a bridge to a serial port with another baud rate or protocol"
             )
         case TcpAddress(port=port):
             return (

@@ -135,8 +135,8 @@ def test_a_vehicle_is_followed_however_often_it_moves() -> None:
         ([], "heard nothing"),
         ([(Endpoint(255, 190), heartbeat(6, 8))], "heard only GCS (system 255, component 190)"),
         ([(Endpoint(1, 1), heartbeat(2, 8))], "no autopilot"),  # quadrotor type, but no autopilot
-        ([(Endpoint(1, 42), heartbeat(2, 3))], "as component 42"),
-        ([(Endpoint(0, 1), heartbeat(2, 3))], "as system 0, which means all systems"),
+        ([(Endpoint(1, 42), heartbeat(2, 3))], "as system 1, component 42,"),
+        ([(Endpoint(0, 1), heartbeat(2, 3))], "as system 0, component 1,"),
         ([(Endpoint(255, 191), heartbeat(18, 8))], "heard only what this computer sends"),
     ],
 )
@@ -168,13 +168,16 @@ def hearing(
     ("link", "expected"),
     [
         (hearing("/dev/ttyACM0,921600"), ("silent at 921600 baud", "TX and RX")),
-        (hearing("/dev/ttyACM0,921600", 30_000), ("6.0 kB/s came", "baud rate than 921600")),
+        (
+            hearing("/dev/ttyACM0,921600", 30_000),
+            ("6.0 kB/s came", "is 921600 the vehicle's"),
+        ),
         (hearing("/dev/ttyACM0,921600", 30_000, 9), ("without a heartbeat",)),
         (hearing("tcp:127.0.0.1:5760"), ("not a byte", "one client on TCP 5760")),
         (hearing("/dev/ttyACM0", 0, 0, "gone"), ("connection is lost (gone): plug it in",)),
         (hearing("tcp:127.0.0.1:5760", 99, 0, "ended"), ("lost (ended): is its server running?",)),
         (hearing("/dev/ttyACM0", 90, 9, radio=9), ("this end's telemetry radio", "paired")),
-        (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "another service", "a bridge")),
+        (hearing("tcp:127.0.0.1:5760", 500), ("0.1 kB/s came", "or service", "a bridge")),
         (hearing("udp:127.0.0.1:14550"), ("send to port 14550",)),
         (hearing("udpout:127.0.0.1:14550"), ("nobody answered",)),
         (hearing("udp:127.0.0.1:14550", 500), ("another program",)),
