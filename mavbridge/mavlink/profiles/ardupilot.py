@@ -211,12 +211,8 @@ def _override_notes(
             )
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:
-        yield ParamNote(
-            "obstacle",
-            ("RC_OPTIONS",),
-            "RC_OPTIONS bit 1 (ignore overrides) is set",
-            f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}",
-        )
+        effect, mended = ", whose bit 1 ignores overrides", options & ~_IGNORE_OVERRIDES
+        yield ParamNote.of("obstacle", "RC_OPTIONS", options, effect, mended)
     yield from stick_notes(values)
     yield from _timeout_notes(values, context)
     for names, unknown in (
@@ -272,14 +268,10 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
         mended = int(options) | _THRUST_AS_THRUST
         yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
     yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
-    if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
-        yield ParamNote(
-            "advice",
-            ("FS_THR_ENABLE",),
-            "no receiver was seen: the vehicle will not arm without one while its throttle "
-            "failsafe is on; setpoints do not need it",
-            "--set FS_THR_ENABLE=0",
-        )
+    failsafe = values.get("FS_THR_ENABLE", 0.0)
+    if context.has_receiver is False and failsafe != 0:
+        effect = ": no receiver was seen, and it will not arm without one; setpoints need none"
+        yield ParamNote.of("advice", "FS_THR_ENABLE", failsafe, effect, 0)
     if context.output == "attitude" and values.get("ATC_ANGLE_BOOST") == 0:
         effect = ": thrust is not raised when it leans, the policy has to do it"
         yield ParamNote.of("advice", "ATC_ANGLE_BOOST", 0.0, effect)

@@ -56,10 +56,8 @@ class VehicleDiscovery:
 
     def __init__(self, *, target_system: int) -> None:
         self._target_system = target_system
-        self._heard_ns: dict[VehicleIdentity, int] = {}
-        """Last heartbeat of each vehicle, the oldest first."""
-        self._begun_ns: dict[VehicleIdentity, int] = {}
-        """First heartbeat of each vehicle."""
+        self._heard_ns: dict[VehicleIdentity, tuple[int, int]] = {}
+        """First and last heartbeat of each vehicle, in the order of the last."""
         self._others: dict[str, Endpoint] = {}
         self._odd_ids: set[Endpoint] = set()
         """Autopilots with another component than 1, or with system 0."""
@@ -89,13 +87,10 @@ class VehicleDiscovery:
             vehicle_type=heartbeat.vehicle_type,
             autopilot=heartbeat.autopilot,
         )
-        self._begun_ns.setdefault(vehicle, now_ns)
-        self._heard_ns.pop(vehicle, None)
+        first_ns, _ = self._heard_ns.pop(vehicle, (now_ns, now_ns))
         if len(self._heard_ns) >= _CAPACITY:
-            oldest = next(iter(self._heard_ns))
-            del self._heard_ns[oldest]
-            self._begun_ns.pop(oldest, None)
-        self._heard_ns[vehicle] = now_ns
+            del self._heard_ns[next(iter(self._heard_ns))]
+        self._heard_ns[vehicle] = first_ns, now_ns
         if self._first_ns is None and self._is_wanted(vehicle):
             self._first_ns = now_ns
 
@@ -104,11 +99,14 @@ class VehicleDiscovery:
 
     def _is_present(self, vehicle: VehicleIdentity) -> bool:
         """False for a type heard once among others at its address, perhaps damaged, or replaced."""
-        place, heard_ns = (vehicle.source, vehicle.address), self._heard_ns[vehicle]
-        others = [each for each in self._begun_ns if (each.source, each.address) == place]
-        others.remove(vehicle)
-        is_replaced = any(heard_ns < self._begun_ns[e] < self._heard_ns[e] for e in others)
-        return not others or (self._begun_ns[vehicle] < heard_ns and not is_replaced)
+        others = [
+            times
+            for each, times in self._heard_ns.items()
+            if (each.source, each.address) == (vehicle.source, vehicle.address) and each != vehicle
+        ]
+        first_ns, last_ns = self._heard_ns[vehicle]
+        is_replaced = any(last_ns < first < last for first, last in others)
+        return not others or (first_ns < last_ns and not is_replaced)
 
     def is_settling(self, now_ns: int) -> bool:
         """True if a vehicle was heard, but a second one may still appear."""
@@ -120,9 +118,9 @@ class VehicleDiscovery:
         Raises:
             PeerError: several vehicles are possible, or two cannot be told apart.
         """
-        if self._first_ns is None or now_ns - self._first_ns < SETTLE_NS:
+        if self._first_ns is None or self.is_settling(now_ns):
             return None
-        present = filter(self._is_present, self._begun_ns)
+        present = filter(self._is_present, self._heard_ns)
         wanted = [vehicle for vehicle in present if self._is_wanted(vehicle)]
         systems = sorted({vehicle.source.system for vehicle in wanted})
         if len(systems) > 1:
@@ -142,9 +140,9 @@ class VehicleDiscovery:
     def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
         """Return the vehicle at its new address or with its new type; None if it has neither."""
         # One that was followed to a new address may not have sent a heartbeat from there yet.
-        if now_ns - self._heard_ns.setdefault(vehicle, now_ns) < MOVED_NS:
+        if now_ns - self._heard_ns.setdefault(vehicle, (now_ns, now_ns))[1] < MOVED_NS:
             return None
-        for other, heard_ns in self._heard_ns.items():
+        for other, (_, heard_ns) in self._heard_ns.items():
             if other.source == vehicle.source and now_ns - heard_ns < SETTLE_NS:
                 return other
         return None

@@ -85,10 +85,10 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
 
 def received_bytes_per_s(streams: Iterable[StreamGroup], frame_bytes: int = _FRAME_BYTES) -> float:
     """Return the bandwidth of these streams with full-length messages, rare ones excluded."""
-    steady = [(stream.rate_hz, stream.messages[0]) for stream in streams if stream.least_hz is None]
     streamed: float = sum(
-        rate_hz * (frame_bytes + dialect.mavlink_map[IDS[name]].unpacker.size)
-        for rate_hz, name in steady
+        stream.rate_hz * (frame_bytes + dialect.mavlink_map[IDS[stream.messages[0]]].unpacker.size)
+        for stream in streams
+        if stream.least_hz is None
     )
     return _OTHERS_BYTES_PER_S + streamed
 

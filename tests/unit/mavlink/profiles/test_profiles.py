@@ -138,7 +138,7 @@ def test_advice(
         ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 255.0}, "rc-override", None),
         ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 0.0}, "rc-override", "obeys system 240"),
         ({"SYSID_MYGCS": 252.0}, "rc-override", "obeys system 252"),
-        ({"RC_OPTIONS": 34.0}, "rc-override", "RC_OPTIONS bit 1 .* --set RC_OPTIONS=32"),
+        ({"RC_OPTIONS": 34.0}, "rc-override", "RC_OPTIONS is 34, .* bit 1 .* --set RC_OPTIONS=32"),
         ({"RC_OPTIONS": 32.0}, "rc-override", None),
         ({"RC_OVERRIDE_TIME": 0.0}, "rc-override", "RC_OVERRIDE_TIME is 0"),
     ],
