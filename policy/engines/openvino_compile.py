@@ -39,45 +39,37 @@ def user_cache_folder() -> Path:
     return root / "mavbridge"
 
 
-class CompileCache:
-    """Cache of bytes by key, one file each in one folder."""
+def load_blob(path: Path) -> bytes | None:
+    """Return the bytes stored in a file; None if there are none, or they are damaged."""
+    try:
+        content = path.read_bytes()
+        path.touch()
+    except OSError:
+        return None
+    digest, blob = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    return blob if hashlib.sha256(blob).digest() == digest else None
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
 
-    def load(self, key: str) -> bytes | None:
-        """Return the bytes stored under ``key``; None if there are none, or they are damaged."""
-        path = self._path(key)
-        try:
-            content = path.read_bytes()
-            path.touch()
-        except OSError:
-            return None
-        digest, blob = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-        return blob if hashlib.sha256(blob).digest() == digest else None
+def store_blob(path: Path, blob: bytes) -> None:
+    """Store ``blob`` if possible; drop the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES``."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as draft:
+            draft.write_bytes(hashlib.sha256(blob).digest() + blob)
+        _make_room(path.parent)
 
-    def store(self, key: str, blob: bytes) -> None:
-        """Store ``blob`` if possible; drop the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES``."""
-        with contextlib.suppress(OSError):
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with whole_file(self._path(key)) as draft:
-                draft.write_bytes(hashlib.sha256(blob).digest() + blob)
-            self._make_room()
 
-    def _path(self, key: str) -> Path:
-        return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()}.graph"
-
-    def _make_room(self) -> None:
-        entries = []
-        for path in self._folder.glob("*.graph*"):  # leftovers of a killed process count too
-            with contextlib.suppress(FileNotFoundError):  # another process made room
-                stat = path.stat()
-                entries.append((stat.st_mtime_ns, path, stat.st_size))
-        total = 0
-        for place, (_, path, size) in enumerate(sorted(entries, reverse=True)):
-            total += size
-            if place >= MAX_ENTRIES or total > MAX_BYTES:
-                path.unlink(missing_ok=True)
+def _make_room(folder: Path) -> None:
+    entries = []
+    for path in folder.glob("*.graph*"):  # leftovers of a killed process count too
+        with contextlib.suppress(FileNotFoundError):  # another process made room
+            stat = path.stat()
+            entries.append((stat.st_mtime_ns, path, stat.st_size))
+    total = 0
+    for place, (_, path, size) in enumerate(sorted(entries, reverse=True)):
+        total += size
+        if place >= MAX_ENTRIES or total > MAX_BYTES:
+            path.unlink(missing_ok=True)
 
 
 NAME = "openvino"
@@ -146,7 +138,7 @@ def compile_graph(subject: str, precision: Precision, build: Callable[[], "ov.Mo
         "ENABLE_CPU_PINNING": "NO",
         "INFERENCE_PRECISION_HINT": precision,
     }
-    core, cache, code = ov.Core(), CompileCache(user_cache_folder() / NAME), hashlib.sha256()
+    core, code = ov.Core(), hashlib.sha256()
     here = Path(__file__).parent
     for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
         code.update(source.read_bytes())
@@ -155,14 +147,14 @@ def compile_graph(subject: str, precision: Precision, build: Callable[[], "ov.Mo
     ]
     versions = f"{ov.__version__} {torch.__version__}"
     key = f"{subject} {code.hexdigest()} {versions} {facts} {properties}"
-    stored = cache.load(key)
-    if stored is not None:
+    path = user_cache_folder() / NAME / f"{hashlib.sha256(key.encode()).hexdigest()}.graph"
+    if (stored := load_blob(path)) is not None:
         try:
             return Graph(core.import_model(io.BytesIO(stored), DEVICE, properties))
         except RuntimeError:
             pass  # from another build: compile it again
     compiled = core.compile_model(build(), DEVICE, properties)
-    cache.store(key, compiled.export_model().getvalue())
+    store_blob(path, compiled.export_model().getvalue())
     return Graph(compiled)
 
 

@@ -17,8 +17,9 @@ from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_compile import (
     MAX_BYTES,
     MAX_ENTRIES,
-    CompileCache,
+    load_blob,
     precisions,
+    store_blob,
     user_cache_folder,
 )
 from policy.engines.openvino_modules import MAX_UNROLLED, ModuleConverter, make_module_runner
@@ -155,20 +156,19 @@ def test_a_signal_is_heard_whatever_has_become_of_the_engine_which_does_not_call
 BLOB = b"a compiled graph" * 100
 
 
-def test_keeps_what_was_stored_by_key_until_it_is_damaged(tmp_path: Path) -> None:
-    cache = CompileCache(tmp_path / "new" / "folder")
-    assert cache.load("a") is None
-    cache.store("a", BLOB)
-    (path,) = (tmp_path / "new" / "folder").iterdir()
-    cache.store("b", b"")
-    assert (cache.load("a"), cache.load("b"), cache.load("c")) == (BLOB, b"", None)
+def test_keeps_what_was_stored_until_it_is_damaged(tmp_path: Path) -> None:
+    path, other = (tmp_path / "new" / "folder" / f"{name}.graph" for name in "ab")
+    assert load_blob(path) is None
+    store_blob(path, BLOB)
+    store_blob(other, b"")
+    assert (load_blob(path), load_blob(other)) == (BLOB, b"")
     whole = path.read_bytes()
     flipped = [whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :] for at in (0, 31, 32, 500)]
     for damaged in (*(whole[:kept] for kept in (0, 1, 31, 32, 33, len(whole) - 1)), *flipped):
         path.write_bytes(damaged)
-        assert cache.load("a") is None
-    cache.store("a", b"newer")
-    assert cache.load("a") == b"newer"
+        assert load_blob(path) is None
+    store_blob(path, b"newer")
+    assert load_blob(path) == b"newer"
 
 
 @pytest.mark.parametrize(
@@ -177,22 +177,21 @@ def test_keeps_what_was_stored_by_key_until_it_is_damaged(tmp_path: Path) -> Non
 )
 def test_the_least_recently_used_goes_first(tmp_path, monkeypatch, most_bytes, kept):
     count = 5 if most_bytes < MAX_BYTES else MAX_ENTRIES
-    cache = CompileCache(tmp_path)
-    for index in range(count):  # each a second after the one before
-        cache.store(str(index), BLOB)
-        newest = max(tmp_path.iterdir(), key=lambda path: path.stat().st_mtime_ns)
-        os.utime(newest, (index, index))
-    assert cache.load("0") == BLOB  # used: now the newest
+    paths = [tmp_path / f"{index}.graph" for index in range(count + 1)]
+    for index, path in enumerate(paths[:count]):  # each a second after the one before
+        store_blob(path, BLOB)
+        os.utime(path, (index, index))
+    assert load_blob(paths[0]) == BLOB  # used: now the newest
     monkeypatch.setattr(openvino_compile, "MAX_BYTES", most_bytes)
-    cache.store(str(count), BLOB)
-    assert {n for n in range(count + 1) if cache.load(str(n)) is not None} == kept
+    store_blob(paths[count], BLOB)
+    assert {n for n, path in enumerate(paths) if load_blob(path) is not None} == kept
 
 
 def test_a_folder_that_cannot_be_used_means_no_cache(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
-    cache = CompileCache(tmp_path / "file" / "below")
-    cache.store("a", BLOB)
-    assert cache.load("a") is None
+    path = tmp_path / "file" / "below" / "a.graph"
+    store_blob(path, BLOB)
+    assert load_blob(path) is None
 
 
 def test_the_folder_is_where_xdg_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
