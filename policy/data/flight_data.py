@@ -30,7 +30,7 @@ class DatasetError(PolicyError):
 
 
 class NothingToLearnError(DatasetError):
-    """Flight that adds nothing to others: nobody flew in it, or it is a copy."""
+    """Flight that adds nothing to others: it is empty or a copy, or nobody flew in it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,8 +71,6 @@ def failure_of(folder: Path) -> str | None:
     outcome = meta.get("outcome")
     outcome = outcome if isinstance(outcome, dict) else {}
     source, success = meta.get("source"), meta.get("success")
-    if meta.get("ticks") == 0 or (meta.get("finished") is False and _is_bare(folder)):
-        return "empty"
     if source == "dagger" or success is True:
         return None
     if meta.get("crash") or outcome.get("crash"):
@@ -86,17 +84,6 @@ def failure_of(folder: Path) -> str | None:
     return "off the course" if success is False and not _is_corrected(folder, meta) else None
 
 
-def _is_bare(folder: Path) -> bool:
-    """True if a recording was cut off before the first rows of one of its tables."""
-    tables = {"ticks": _TICK_COLUMNS, "frames": _FRAME_COLUMNS}
-    try:
-        return not all(
-            read_rows(folder / stem, [], columns)[0].num_rows for stem, columns in tables.items()
-        )
-    except DatasetError:
-        return False
-
-
 def _is_corrected(folder: Path, meta: Mapping[str, object]) -> bool:
     try:
         ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, [])
@@ -108,20 +95,15 @@ def _is_corrected(folder: Path, meta: Mapping[str, object]) -> bool:
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """Return the flights to learn from, and a line with the exclusions and their reasons.
-
-    Empty flights are left out in any case.
-    """
+    """Return the flights to learn from, and a line with the exclusions and their reasons."""
     failures = {folder: failure_of(folder) for folder in folders}
-    excluded = {why for why in failures.values() if why and not include_failed} | {"empty"}
-    exemplary = [folder for folder in folders if failures[folder] not in excluded]
-    counts = Counter(why for why in failures.values() if why in excluded)
+    counts = Counter(why for why in failures.values() if why and not include_failed)
     if not counts:
-        return exemplary, None
+        return list(folders), None
+    exemplary = [folder for folder in folders if failures[folder] is None]
     failed = counts.total()
     why = ", ".join(f"{count} {kind}" for kind, count in counts.most_common())
-    is_empty = set(counts) == {"empty"}
-    advice = "nothing was flown" if is_empty else "--include-failed takes in all but empty ones"
+    advice = "--include-failed takes in all but empty ones"
     if not exemplary:
         raise DatasetError(f"all {failed} flights have failed ({why}): {advice}")
     return exemplary, f"left out: {failed} of {len(folders)} flights that failed ({why}): {advice}"
@@ -132,7 +114,7 @@ def read_flights(
     camera: str | None = None,
     progress: Callable[[], None] = lambda: None,
 ) -> tuple[list[FlightData], list[str]]:
-    """Read flights, except copies of others and those in which nobody flew.
+    """Read flights, except empty ones, copies of others and those in which nobody flew.
 
     A copy could be both trained on and held out. Returns a sentence about each flight left out.
     """
@@ -179,7 +161,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
     video = folder / f"camera{suffix}.mp4"
-    if not video.is_file() or frames.num_rows == 0:
+    if not video.is_file():
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     try:
         places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)
@@ -344,10 +326,10 @@ def _read_table(
     folder: Path, stem: str, columns: tuple[str, ...], damage: list[str]
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     table, numbers = read_rows(folder / stem, damage, columns)
+    if table.num_rows == 0:  # perhaps killed before its first rows
+        raise NothingToLearnError(f"{folder}: no {stem}: nothing was flown")
     if missing := [name for name in columns if name not in table.column_names]:
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
-    if table.num_rows == 0 and stem == "ticks":
-        raise DatasetError(f"{folder}: no ticks: nothing was flown")
     for column in filter(_TYPES.__contains__, columns):
         table = retyped(f"{folder}, {stem}", table, column, _TYPES[column])
     return table, numbers

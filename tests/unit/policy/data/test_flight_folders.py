@@ -178,16 +178,6 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
     assert leave_out_failed([], include_failed=False) == ([], None)
     with pytest.raises(DatasetError, match="all 1 flights have failed"):
         leave_out_failed([tmp_path / "b"], include_failed=False)
-    write_meta(tmp_path / "c", ticks=0)
-    kept, note = leave_out_failed(folders, include_failed=True)
-    assert kept == [folder for folder in folders if folder.name != "c"]
-    assert note == "left out: 1 of 5 flights that failed (1 empty): nothing was flown"
-    with pytest.raises(DatasetError, match="nothing was flown"):
-        leave_out_failed([tmp_path / "c"], include_failed=True)
-    write_meta(tmp_path / "c", source="pilot", finished=False, ticks=None)
-    for name in ("ticks", "frames"):  # killed before its first rows
-        (tmp_path / "c" / f"{name}.arrows").touch()
-    assert failure_of(tmp_path / "c") == "empty"
 
 
 def test_no_flights_are_refused(tmp_path: Path) -> None:
@@ -259,16 +249,21 @@ def test_a_flight_that_nothing_can_be_learned_from_is_refused(
         read_flight(folder)
 
 
-def test_copies_and_flights_in_which_nobody_flew_are_left_out(tmp_path: Path) -> None:
+def test_flights_with_nothing_to_learn_are_left_out(tmp_path: Path) -> None:
     """One of them must not keep the others from being learned from."""
     first, idle = flight(tmp_path / "a"), flight(tmp_path / "b", expert=[None] * 3)
     copy = Path(shutil.copytree(first, tmp_path / "copy"))
-    flights, left_out = read_flights([first, idle, copy])
+    bare = tmp_path / "bare"
+    write_meta(bare, source="pilot", finished=False, ticks=None)
+    for name in ("ticks", "frames"):  # killed before its first rows
+        (bare / f"{name}.arrows").touch()
+    flights, left_out = read_flights([first, idle, copy, bare])
     assert [each.name for each in flights] == [str(first)]
     assert [text.partition(": ")[2] for text in left_out] == [
         f"{idle}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks of "
         "a pilot while armed and in ALT_HOLD or ALTCTL",
         f"{copy}: a copy of {first}",
+        f"{bare}: no ticks: nothing was flown",
     ]
     with pytest.raises(DatasetError, match="nobody to learn from"):
         read_flights([idle])
@@ -322,7 +317,6 @@ def test_flights_of_one_course_are_held_out_together(tmp_path: Path) -> None:
     [
         ({"source": "demonstration", "success": False}, "off the course"),
         ({"source": "dagger", "success": False}, None),
-        ({"source": "dagger", "success": False, "ticks": 0}, "empty"),
         ({"source": "flight", "success": None, "finished": False}, "cut off"),
         ({"source": "flight", "success": None, "outcome": {"end": "duration"}}, None),
         ({"source": "flight", "success": None, "outcome": {"end": "fault"}}, "ended by a fault"),
