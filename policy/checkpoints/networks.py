@@ -52,6 +52,8 @@ from policy.preprocess import image_to_input
 Config = TypeVar("Config", bound=BuiltinConfig | WorldModelConfig)
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
+KIND_KEY = "policy"
+"""Name of ``BuiltinConfig.kind`` in a header."""
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
 VECTOR_STEPS = 10
 """Denoising steps of a test vector, or all if the schedule has fewer; its noise has seed 0."""
@@ -84,7 +86,7 @@ def save_checkpoint(
         policy.load_state_dict(unpack(state))
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
-    architecture = config_json(policy.config, policy=policy.config.kind)
+    architecture = config_json(policy.config)
     contract = policy.contract.to_json()
     header = {CONTRACT_KEY: contract, ARCHITECTURE_KEY: architecture, TRAINING_KEY: training}
     write_tensors(path, state, header)
@@ -101,7 +103,7 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     if path.suffix == ".safetensors":
         header, tensors = read_tensors(path)
         require_header(path, header)
-        config = _config_of(path, header, ARCHITECTURE_KEY, type(fallback))
+        config = _config_of(path, header, ARCHITECTURE_KEY, BuiltinConfig, kind=fallback.kind)
         ours = [name for name in tensors if name.startswith(VECTOR_PREFIX)]
         vector = {name.removeprefix(VECTOR_PREFIX): tensors.pop(name) for name in ours}
         state = unpack(tensors)
@@ -160,21 +162,25 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def config_json(config: BuiltinConfig | WorldModelConfig, **more: str) -> str:
+def config_json(config: BuiltinConfig | WorldModelConfig) -> str:
     """Return the header form of a configuration: without the contract, which has its own entry."""
-    data = {name: value for name, value in asdict(config).items() if name != "contract"}
-    return json.dumps({**more, **data}, sort_keys=True)
+    data = {KIND_KEY if name == "kind" else name: value for name, value in asdict(config).items()}
+    del data["contract"]
+    return json.dumps(data, sort_keys=True)
 
 
-def _config_of(path: Path, header: dict[str, str], key: str, wanted: type[Config]) -> Config:
-    """Return the configuration under ``key`` of a file's header."""
+def _config_of(
+    path: Path, header: dict[str, str], key: str, wanted: type[Config], kind: str | None = None
+) -> Config:
+    """Return the configuration under ``key`` of a file's header, of this kind if there are any."""
     text = header[key]
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
         data = parse_object(text, CheckpointError, f"malformed {key}: it")
-        kind, own = data.pop("policy", None), getattr(wanted, "kind", None)
-        if kind != own:
-            raise CheckpointError(f"it holds a {kind}, no {own}: fly it by --policy {kind}")
+        if kind is not None:
+            if (found := data.pop(KIND_KEY, None)) != kind:
+                raise CheckpointError(f"it holds a {found}, no {kind}: fly it by --policy {found}")
+            data["kind"] = kind
         return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error

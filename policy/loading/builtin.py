@@ -19,7 +19,7 @@ SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
 
 def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
     """Return the built-in network of ``spec``, with the default contract at that image size."""
-    from policy.nets.toge import ResnetUnetConfig, TogeConfig
+    from policy.nets.toge import BuiltinConfig
 
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
@@ -30,8 +30,8 @@ def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
     if kind == "resnet-unet":
-        return ResnetUnetConfig(size=size, contract=contract)
-    return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
+        return BuiltinConfig(kind="resnet-unet", size=size, backbone="resnet18", contract=contract)
+    return BuiltinConfig(size=size, backbone=backbone or "resnet8", contract=contract)
 
 
 def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
@@ -103,8 +103,8 @@ def _trained(
             f"{checkpoint} holds no contract; it is flown with frame {contract.state_frame}, "
             f"image {contract.image_width}x{contract.image_height}, "
             f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the sample, "
+            f"{schedule.betas} betas: is that how it was trained?"
         )
         notes.append(warned(told))
     return policy, notes

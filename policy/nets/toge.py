@@ -9,7 +9,6 @@ has no fast path, and takes the history as it is.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +17,7 @@ from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
 from policy.nets.attention import Attention, is_tracing
 from policy.nets.diffusion import DiffusionHead, NoiseSchedule, size_dims
-from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
+from policy.nets.names import BACKBONE_NAMES, BackboneName, Network, Size
 from policy.nets.resnet import build_backbone
 from policy.preprocess import egocentric_columns, egocentric_scale
 
@@ -121,18 +120,18 @@ class Fusion(nn.Module):
 class BuiltinConfig:
     """Architecture settings."""
 
-    kind: ClassVar[str]
+    kind: Network = "toge"
     """Name of the network in --policy and in checkpoints."""
     size: Size = "small"
-    backbone: BackboneName
+    backbone: BackboneName = "resnet8"
     contract: Contract = field(default_factory=Contract)
     """``feature_dim`` 0 is replaced by the network's own."""
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     @property
     def feature_dim(self) -> int:
-        """``feature_dim`` of the contract."""
-        return 0
+        """Width of the cached feature; 0 for the network without a fast path."""
+        return size_dims(self.size).base_dim if self.kind == "toge" else 0
 
     def __post_init__(self) -> None:
         size_dims(self.size)
@@ -151,6 +150,8 @@ class BuiltinConfig:
             )
         if self.contract.prefix_len:
             raise ContractError(f"{self.kind} takes no prefix: leave prefix_len out")
+        if self.schedule.prediction != "sample":
+            raise PolicyError(f"the schedule of {self.kind} must predict the sample")
 
 
 class BuiltinPolicy(nn.Module):
@@ -179,6 +180,18 @@ class BuiltinPolicy(nn.Module):
         """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
         raise NotImplementedError
 
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """Call the network once on noisy actions [B, horizon, 4] at timesteps [B]."""
+        condition = self.condition(feature, self.state_encoder(state), action_history)
+        return self.head.denoise(noisy, timestep, condition)
+
     def _encode(self, image: Tensor) -> Tensor:
         require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
         feature: Tensor = self.visual_projection(self.backbone(image))
@@ -197,23 +210,10 @@ class BuiltinPolicy(nn.Module):
         return self._sample(self._encode(image), state, action_history, num_diffusion_steps)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TogeConfig(BuiltinConfig):
-    """Architecture settings of TOGE."""
-
-    kind: ClassVar[str] = "toge"
-    backbone: BackboneName = "resnet8"
-
-    @property
-    def feature_dim(self) -> int:
-        """Width of the cached feature."""
-        return size_dims(self.size).base_dim
-
-
 class Toge(BuiltinPolicy):
     """TOGE behind ``protocol.StepwisePolicy``."""
 
-    def __init__(self, config: TogeConfig) -> None:
+    def __init__(self, config: BuiltinConfig) -> None:
         super().__init__(config)
         dim = config.feature_dim
         self.history_encoder = HistoryEncoder(dim // 4, self.contract.history_len)
@@ -246,35 +246,15 @@ class Toge(BuiltinPolicy):
         """[1, horizon, 4]; fixed for a whole flight."""
         return self.head.initial_noise
 
-    def denoise(
-        self,
-        noisy: Tensor,
-        timestep: Tensor,
-        feature: Tensor,
-        state: Tensor,
-        action_history: Tensor,
-    ) -> Tensor:
-        """Call the network once on noisy actions [B, horizon, 4] at timesteps [B]."""
-        condition = self.condition(feature, self.state_encoder(state), action_history)
-        return self.head.denoise(noisy, timestep, condition)
-
     def to_chunk(self, sample: Tensor) -> Tensor:
         """Return the end of a solve as it is."""
         return sample
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResnetUnetConfig(BuiltinConfig):
-    """Architecture settings of ResNet-UNet."""
-
-    kind: ClassVar[str] = "resnet-unet"
-    backbone: BackboneName = "resnet18"
-
-
 class ResnetUnet(BuiltinPolicy):
     """Plain diffusion policy without a fast path."""
 
-    def __init__(self, config: ResnetUnetConfig) -> None:
+    def __init__(self, config: BuiltinConfig) -> None:
         super().__init__(config)
         dim = size_dims(config.size).base_dim
         history_dim = self.contract.history_len * ACTION_DIM
@@ -293,8 +273,4 @@ class ResnetUnet(BuiltinPolicy):
 
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
     """Build the network of ``config``, with random weights from torch's global generator."""
-    if isinstance(config, TogeConfig):
-        return Toge(config)
-    if isinstance(config, ResnetUnetConfig):
-        return ResnetUnet(config)
-    raise TypeError(f"no network has a {type(config).__name__}")
+    return Toge(config) if config.kind == "toge" else ResnetUnet(config)

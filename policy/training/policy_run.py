@@ -221,7 +221,7 @@ def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
         for config, contract in ((network, wanted), (policy.config, policy.contract))
     )
     other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
-    if other or type(policy.config) is not type(network):
+    if other:
         raise PolicyError(
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )

@@ -107,9 +107,7 @@ class Trainee(nn.Module):
         noise, schedule = batch.noise[::every], self.policy.config.schedule
         noisy = schedule.add_noise(chunk, noise, timestep)
         made = self.policy.head.denoise(noisy, timestep, condition[::every]).float()
-        is_sample = schedule.prediction == "sample"
-        error = (made - chunk) / self.stick_std if is_sample else made - noise
-        return _squared(error, batch.known[::every])
+        return _squared((made - chunk) / self.stick_std, batch.known[::every])
 
 
 def _squared(error: Tensor, known: Tensor) -> Tensor:

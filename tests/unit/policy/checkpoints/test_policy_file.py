@@ -18,7 +18,7 @@ from policy.checkpoints.tensors import pack, unpack
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.toge import Toge, TogeConfig, build_policy
+from policy.nets.toge import BuiltinConfig, Toge, build_policy
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +41,13 @@ def contents_of(path: Path) -> dict[str, torch.Tensor]:
 
 def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     contract = Contract(image_height=32, image_width=48, state_frame="enu_flu", horizon=8)
-    schedule = NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50)
-    config = TogeConfig(backbone="resnet8", contract=contract, schedule=schedule)
+    schedule = NoiseSchedule(betas="linear", num_train_timesteps=50)
+    config = BuiltinConfig(backbone="resnet8", contract=contract, schedule=schedule)
     policy = build_policy(config).eval()
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, policy)
     assert contents_of(path)["test_vector.chunks"].abs().max() > 0.1
-    loaded = load_checkpoint(path, fallback=TogeConfig())
+    loaded = load_checkpoint(path, fallback=BuiltinConfig())
     assert loaded.config == policy.config
     assert not loaded.training
     for name, value in policy.state_dict().items():
@@ -105,7 +105,7 @@ def test_headers_of_another_build_are_refused(
         header[key] = merged
     # Next to no weights: the header is looked at first.
     save_file({"weight": torch.zeros(1)}, path, metadata=header)
-    reads = [partial(load_checkpoint, fallback=TogeConfig())]
+    reads = [partial(load_checkpoint, fallback=BuiltinConfig())]
     if key == "contract" and "feature_dim" not in message:  # that is the network's to say
         reads.append(read_contract)
     for read in reads:
@@ -236,7 +236,7 @@ def test_state_dicts_load_bare_and_as_training_loops_save_them(small_toge, tmp_p
         ),
         (lambda s: {**s, NAME: torch.zeros(3, 7)}, r"is \[3, 7\], must be \[512"),
         (
-            lambda s: Toge(TogeConfig(backbone="resnet18")).state_dict(),
+            lambda s: Toge(BuiltinConfig(backbone="resnet18")).state_dict(),
             r"does not fit this policy in \d+ places: missing.*size and encoder",
         ),
     ],

@@ -15,7 +15,7 @@ from policy.engines.choose import (
 )
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_engines import make_cuda_graph_runner, make_torch_runner
-from policy.nets.toge import BuiltinPolicy, Toge, TogeConfig
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, Toge
 
 pytestmark = [
     pytest.mark.gpu,
@@ -29,7 +29,7 @@ ON_GPU = ExecutionSettings(name="toge", device="cuda")
 @pytest.mark.parametrize("size", ["shipped", "large"])
 def test_the_graph_computes_what_torch_computes(trained_toge: BuiltinPolicy, size: str) -> None:
     torch.manual_seed(0)
-    large = TogeConfig(size="large", contract=SMALL)
+    large = BuiltinConfig(size="large", contract=SMALL)
     policy = trained_toge if size == "shipped" else Toge(large).eval()
     samples, plain = make_parity_samples(policy.contract), ExecutionSettings(name="t")
     expected = chunks_of_samples(make_torch_runner(policy, plain), samples)

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from helpers.programs import ended
-from policy.checkpoints.networks import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_compile
 from policy.engines.choose import chunks_of_samples, make_parity_samples
@@ -27,7 +26,7 @@ from policy.engines.runner import ExecutionSettings, Precision
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.toge import ResnetUnetConfig, TogeConfig
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.protocol import PolicyRunner
 
 SMALL = Contract(image_height=32, image_width=32)
@@ -61,17 +60,17 @@ def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray
     return chunks_of_samples(reference, samples), chunks_of_samples(runner, samples)
 
 
-OTHER = TogeConfig(
+OTHER = BuiltinConfig(
     backbone="resnet18",
     contract=Contract(image_height=32, image_width=48, horizon=8, history_len=2),
-    schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
+    schedule=NoiseSchedule(betas="linear", num_train_timesteps=50),
 )
 
 
 @pytest.mark.parametrize(
     ("config", "steps"),
     [
-        (ResnetUnetConfig(contract=replace(SMALL, since_exposure=True)), 1),
+        (BuiltinConfig(kind="resnet-unet", contract=replace(SMALL, since_exposure=True)), 1),
         (OTHER, MAX_UNROLLED + 1),
     ],
 )
@@ -104,7 +103,7 @@ def cached(folder: Path) -> list[Path]:
 
 def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    policy = seeded(TogeConfig(backbone="resnet8", contract=SMALL))
+    policy = seeded(BuiltinConfig(backbone="resnet8", contract=SMALL))
     samples = make_parity_samples(SMALL)
 
     def chunks(seed: int = 0) -> FloatArray:
