@@ -112,6 +112,18 @@ class StepwisePolicy(DualRatePolicy, Protocol):
         """Convert the end of a solve [B, L, A] to a chunk [B, horizon, 4] of the contract."""
 
 
+def predict_by_steps(
+    self: StepwisePolicy, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
+) -> Any:
+    """``predict_fast`` of a diffusion policy of torch: run a whole solve."""
+    sample = self.initial_noise.expand(len(feature), -1, -1)
+    for step in self.schedule.ddim_steps(num_diffusion_steps):
+        timestep = sample.new_full((1,), float(step.timestep))
+        output = self.denoise(sample, timestep, feature, state, action_history)
+        sample = self.schedule.ddim_update(step, sample, output)
+    return self.to_chunk(sample)
+
+
 def keep_nothing() -> None:
     """No-op: the reset of a policy without state between chunks."""
 

@@ -26,8 +26,8 @@ from policy.contract import ACTION_DIM
 from policy.engines.torch_engines import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
 from policy.files import library_name, why_unreadable
-from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
-from policy.protocol import SingleRatePolicy, predict_by_pair
+from policy.nets.diffusion import NoiseSchedule, flight_noise
+from policy.protocol import SingleRatePolicy, predict_by_pair, predict_by_steps
 
 Call = Callable[..., Any]
 """Part of a policy, called as this module's docstring says."""
@@ -178,18 +178,7 @@ class DenoiserPolicy(HeadPolicy):
         """Call the denoiser once."""
         return self._call(noisy, timestep, feature, *self._own(state, action_history))
 
-    def predict_fast(
-        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
-    ) -> Any:
-        """Run a whole solve, in torch."""
-        ddim = self.schedule.ddim_steps(num_diffusion_steps)
-
-        def denoise(index: int, noisy: Tensor) -> Tensor:
-            timestep = noisy.new_full((1,), float(ddim[index].timestep))
-            made: Tensor = self.denoise(noisy, timestep, feature, state, action_history)
-            return made
-
-        return self.to_chunk(ddim_solve(self.schedule, ddim, denoise, self.initial_noise))
+    predict_fast = predict_by_steps
 
 
 def _with_feature(name: str, encode: Call, interface: Interface) -> Interface:

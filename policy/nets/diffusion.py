@@ -12,7 +12,7 @@ The last step goes to a_s = 1, so that a sample is the net's last estimate of x_
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
@@ -110,19 +110,6 @@ def flight_noise(seed: int, steps: int) -> Tensor:
     return torch.randn(1, steps, ACTION_DIM, generator=torch.Generator().manual_seed(seed))
 
 
-def ddim_solve(
-    schedule: NoiseSchedule,
-    steps: Sequence[DdimStep],
-    denoise: Callable[[int, Tensor], Tensor],
-    noise: Tensor,
-) -> Tensor:
-    """Run reverse ``steps`` from ``noise``; ``denoise(i, noisy)`` is the net at ``steps[i]``."""
-    sample = noise
-    for index, step in enumerate(steps):
-        sample = schedule.ddim_update(step, sample, denoise(index, sample))
-    return sample
-
-
 @lru_cache(maxsize=16)
 def signal_power(schedule: NoiseSchedule) -> tuple[float, ...]:
     """Return a_t for every training timestep, falling from almost 1 to almost 0.
@@ -195,10 +182,10 @@ def size_dims(size: Size) -> SizeDims:
 class DiffusionHead(nn.Module):
     """Denoiser, noise schedule and initial noise.
 
-    If the net predicts the clean chunk, its prediction is the sum of a linear layer's output for
-    the condition and the U-Net's output for the noisy chunk. The linear layer learns the mean chunk
-    within minutes, and the U-Net learns the deviations from it, which are zero at the noisiest
-    step. So a head steers in few steps and after little training.
+    The prediction, a clean chunk, is the sum of a linear layer's output for the condition and the
+    U-Net's output for the noisy chunk. The linear layer learns the mean chunk within minutes, and
+    the U-Net learns the deviations from it, which are zero at the noisiest step. So a head steers
+    in few steps and after little training.
 
     The initial noise is fixed for a flight: equal inputs then give equal sticks, and chunks do not
     jitter from sample to sample. It is not part of a checkpoint. Steps that the schedule does not
@@ -222,15 +209,10 @@ class DiffusionHead(nn.Module):
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """Call the network: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
+        """Call the network: [B, horizon, 4], [B] int64, [B, C] -> the clean chunk."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
         prediction: Tensor = self.unet(noisy, film)
-        return prediction + self.read(condition) if self.reads_condition else prediction
-
-    @property
-    def reads_condition(self) -> bool:
-        """True if ``read`` is part of the prediction, which is then the clean chunk."""
-        return self.schedule.prediction == "sample"
+        return prediction + self.read(condition)
 
     def read(self, condition: Tensor) -> Tensor:
         """Return the mean chunk [B, horizon, 4] for a condition [B, C]."""
@@ -239,17 +221,15 @@ class DiffusionHead(nn.Module):
 
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
         """Sample a chunk [B, horizon, 4] in [-1, 1] for a condition [B, C]."""
-        noise = self.initial_noise.expand(condition.shape[0], -1, -1)
+        sample = self.initial_noise.expand(condition.shape[0], -1, -1)
         steps = self.schedule.ddim_steps(num_diffusion_steps)
         # Selected on the device: a CUDA graph capture allows no copy from the host.
         timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
         # Both parts of FiLM are outside the loop; one product serves all timesteps.
         film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)
         film_of_condition = self.unet.film_of_condition(condition)
-        read = self.read(condition) if self.reads_condition else 0.0
-
-        def denoise(index: int, noisy: Tensor) -> Tensor:
-            prediction: Tensor = self.unet(noisy, film_of_step[index] + film_of_condition)
-            return prediction + read
-
-        return ddim_solve(self.schedule, steps, denoise, noise)
+        read = self.read(condition)
+        for index, step in enumerate(steps):
+            prediction = self.unet(sample, film_of_step[index] + film_of_condition) + read
+            sample = self.schedule.ddim_update(step, sample, prediction)
+        return sample

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Contract
-from policy.nets.diffusion import DdimStep, NoiseSchedule, ddim_solve
+from policy.nets.diffusion import NoiseSchedule
+from policy.protocol import predict_by_steps
 
 SINGLE = Contract(image_height=32, image_width=32, horizon=8)
 DUAL = Contract(image_height=32, image_width=32, horizon=8, feature_dim=12)
@@ -311,16 +312,7 @@ class Stepwise(TwoRates):
     def to_chunk(self, sample: Tensor) -> Tensor:
         return sample
 
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        ddim: tuple[DdimStep, ...] = self.schedule.ddim_steps(steps)
-        return ddim_solve(
-            self.schedule,
-            ddim,
-            lambda at, n: self.denoise(
-                n, torch.full((1,), float(ddim[at].timestep)), feature, state, history
-            ),
-            torch.as_tensor(self.initial_noise),
-        )
+    predict_fast = predict_by_steps
 
 
 class ForwardOnly(nn.Module):

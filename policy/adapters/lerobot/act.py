@@ -11,7 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from policy.adapters.lerobot.base import LeRobotPolicy
 from policy.adapters.lerobot.config import ActConfig, map_size
+from policy.adapters.lerobot.plan import Plan
 from policy.contract import ACTION_DIM
 from policy.nets.attention import Attention
 from policy.nets.resnet import LastMap
@@ -89,17 +91,16 @@ class Stack(nn.Module):
         return out
 
 
-class Act(nn.Module):
+class Act(LeRobotPolicy):
     """Normalised images and state -> normalised actions.
 
     Tokens: the latent, the state if there is one, and the cells of each camera's map.
     """
 
     prefix = "model."
-    """Prefix of the parameter names in LeRobot's file."""
 
-    def __init__(self, config: ActConfig) -> None:
-        super().__init__()
+    def __init__(self, plan: Plan, config: ActConfig) -> None:
+        super().__init__(plan)
         dim, state_dim = config.dim_model, config.features.state_dim
         self.cameras, self.latent_dim = len(config.features.image_keys), config.latent_dim
         self.backbone = LastMap(config.vision_backbone)
@@ -124,12 +125,15 @@ class Act(nn.Module):
         return None if name.startswith("vae_encoder") else name
 
     def encode(self, image: Tensor, _camera: int) -> Tensor:
-        """Encode an image [B, 3, H, W] of any camera -> cells [B, D * h * w]."""
+        """Encode a normalised image [B, 3, H, W] of any camera -> cells [B, D * h * w]."""
         cells: Tensor = self.encoder_img_feat_input_proj(self.backbone(image)).flatten(1)
         return cells
 
-    def act(self, feature: Tensor, state: Tensor, _num_diffusion_steps: int) -> Tensor:
-        """Return actions [B, chunk_size, 4] for features [B, 1, cameras, F] and state [B, 1, S]."""
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+    ) -> Tensor:
+        """Return a chunk [B, horizon, 4] for features [B, cameras * F] and states [B, S]."""
+        feature, state = self.network_inputs(feature, state)
         batch, dim = feature.shape[0], self.encoder_latent_input_proj.out_features
         latent = torch.zeros(batch, self.latent_dim, dtype=feature.dtype, device=feature.device)
         tokens = [self.encoder_latent_input_proj(latent).unsqueeze(1)]
@@ -144,8 +148,7 @@ class Act(nn.Module):
         encoded = self.encoder(torch.cat(tokens, dim=1), position)
         of_actions = self.decoder_pos_embed.weight.unsqueeze(0)
         start = torch.zeros_like(of_actions).expand(batch, -1, -1)
-        actions: Tensor = self.action_head(self.decoder(start, of_actions, encoded, position))
-        return actions
+        return self.in_units(self.action_head(self.decoder(start, of_actions, encoded, position)))
 
 
 def cell_positions(height: int, width: int, dim: int) -> Tensor:

@@ -3,9 +3,6 @@
 LeRobot's default is DDPM with all training steps, which takes seconds and gives a different result
 each time. Here a solve is what LeRobot computes with noise_scheduler_type DDIM: deterministic, in
 few steps, from one fixed noise.
-
-Parameters have LeRobot's names. The U-Net's FiLM layers apply their timestep weights and their
-condition weights separately, so the condition's part is computed once for a whole solve.
 """
 
 from typing import Any
@@ -14,12 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from policy.adapters.lerobot.base import LeRobotPolicy
 from policy.adapters.lerobot.config import DiffusionConfig, map_size
+from policy.adapters.lerobot.plan import Plan
 from policy.contract import ACTION_DIM
 from policy.errors import PolicyError
 from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise, steps_at
 from policy.nets.resnet import LastMap
 from policy.nets.unet1d import GroupNorm, sinusoid_frequencies
+from policy.protocol import predict_by_steps
 
 _PLACES = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
 """LeRobot's names of a ResNet's parts, which it keeps in a list, and torchvision's."""
@@ -69,14 +69,15 @@ class LerobotResidualBlock(nn.Module):
         self.conv1 = ConvBlock(channels_in, channels_out, kernel, groups)
         self.conv2 = ConvBlock(channels_out, channels_out, kernel, groups)
         film_dim = channels_out * (2 if self.scales else 1)
-        self.cond_encoder = nn.Sequential(Mish(), nn.Linear(condition_dim, film_dim))
+        # In place of LeRobot's Mish, which the U-Net applies once for all blocks.
+        self.cond_encoder = nn.Sequential(nn.Identity(), nn.Linear(condition_dim, film_dim))
         self.residual_conv: nn.Module = nn.Identity()
         if channels_in != channels_out:
             self.residual_conv = nn.Conv1d(channels_in, channels_out, 1)
 
-    def forward(self, x: Tensor, film: Tensor) -> Tensor:
-        """Apply the block; ``film`` [B, film_dim] holds scales, if it has any, then shifts."""
-        hidden = self.conv1(x)
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """Apply the block, conditioned by an activated embedding [B, condition_dim]."""
+        hidden, film = self.conv1(x), self.cond_encoder(condition)
         if self.scales:
             scale, shift = film.unsqueeze(-1).chunk(2, dim=1)
             hidden = scale * hidden + shift
@@ -87,7 +88,7 @@ class LerobotResidualBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """Noisy chunk [B, horizon, 4] and FiLM [B, film_dim] -> the net's prediction."""
+    """Noisy chunk [B, horizon, 4], its timestep and a condition [B, C] -> the net's prediction."""
 
     def __init__(self, config: DiffusionConfig, condition_dim: int) -> None:
         super().__init__()
@@ -104,7 +105,6 @@ class UNet(nn.Module):
             Mish(),
             nn.Linear(4 * self.time_dim, self.time_dim),
         )
-        # In the order in which they run: ``_film`` counts on it.
         self.down_modules, self.mid_modules = nn.ModuleList(), nn.ModuleList()
         self.up_modules = nn.ModuleList()
         for level, (into, out) in enumerate(zip((ACTION_DIM, *widths), widths, strict=False)):
@@ -120,39 +120,28 @@ class UNet(nn.Module):
             ConvBlock(widths[0], widths[0], config.kernel_size, 8),
             nn.Conv1d(widths[0], ACTION_DIM, 1),
         )
+        self.activation = Mish()
         self._frequencies = nn.Buffer(sinusoid_frequencies(self.time_dim), persistent=False)
 
-    def film_of_timestep(self, timestep: Tensor) -> list[Tensor]:
-        """Return the part [B, film_dim] of each block's FiLM from float32 timesteps [B]."""
+    def forward(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
+        """Predict, at float32 timesteps [1] or [B], for a condition [B, C]."""
         angle = timestep.unsqueeze(-1) * self._frequencies
         embedded = self.diffusion_step_encoder(torch.cat([angle.sin(), angle.cos()], dim=-1))
-        return self._film(embedded, slice(None, self.time_dim), bias=True)
-
-    def film_of_condition(self, condition: Tensor) -> list[Tensor]:
-        """Return the part [B, film_dim] of each block's FiLM from a condition [B, C]."""
-        return self._film(condition, slice(self.time_dim, None), bias=False)
-
-    def forward(self, noisy: Tensor, films: list[Tensor]) -> Tensor:
-        """Predict; ``films`` holds the FiLM [B, film_dim] of each block, in running order."""
-        x, film, skips = noisy.transpose(1, 2), iter(films), []
+        seen = [embedded.expand(len(condition), -1), condition]
+        active = self.activation(torch.cat(seen, dim=-1))
+        x, skips = noisy.transpose(1, 2), []
         layers: Any = self  # its module lists are not typed
         for first, second, halve in layers.down_modules:
-            x = second(first(x, next(film)), next(film))
+            x = second(first(x, active), active)
             skips.append(x)
             x = halve(x)
         for block in layers.mid_modules:
-            x = block(x, next(film))
+            x = block(x, active)
         for first, second, double in layers.up_modules:
-            x = first(torch.cat([x, skips.pop()], dim=1), next(film))
-            x = double(second(x, next(film)))
+            x = first(torch.cat([x, skips.pop()], dim=1), active)
+            x = double(second(x, active))
         out: Tensor = self.final_conv(x)
         return out.transpose(1, 2)
-
-    def _film(self, value: Tensor, columns: slice, *, bias: bool) -> list[Tensor]:
-        blocks = [module for module in self.modules() if isinstance(module, LerobotResidualBlock)]
-        active: Tensor = blocks[0].cond_encoder[0](value)
-        linears: list[Any] = [block.cond_encoder[1] for block in blocks]
-        return [F.linear(active, m.weight[:, columns], m.bias if bias else None) for m in linears]
 
 
 class SpatialSoftmax(nn.Module):
@@ -240,16 +229,15 @@ class DdimSchedule:
         return after
 
 
-class Diffusion(nn.Module):
-    """Normalised images and states -> normalised actions."""
+class Diffusion(LeRobotPolicy):
+    """DiffusionPolicy behind ``policy.protocol.StepwisePolicy``."""
 
     prefix = "diffusion."
-    """Prefix of the parameter names in LeRobot's file."""
     initial_noise: Tensor
     """[1, predicted, 4]; fixed for a whole flight."""
 
-    def __init__(self, config: DiffusionConfig) -> None:
-        super().__init__()
+    def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
+        super().__init__(plan)
         self.steps_before_now = config.n_obs_steps - 1
         self.schedule = DdimSchedule(config)
         cameras = len(config.features.image_keys)
@@ -274,37 +262,34 @@ class Diffusion(nn.Module):
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def encode(self, image: Tensor, camera: int) -> Tensor:
-        """Encode an image [B, 3, H, W] of one camera -> feature [B, F]."""
+        """Encode a normalised image [B, 3, H, W] of one camera -> feature [B, F]."""
         encoders = self.rgb_encoder
         encoder = encoders[camera] if isinstance(encoders, nn.ModuleList) else encoders
         feature: Tensor = encoder(image)
         return feature
 
-    def film_of_condition(self, feature: Tensor, state: Tensor) -> list[Tensor]:
-        """Return FiLM's part from the features [B, T, cameras, F] and states [B, T, S]."""
-        condition = torch.cat([state, feature.flatten(2)], dim=-1).flatten(1)
-        return self.unet.film_of_condition(condition)
-
-    def denoise(self, noisy: Tensor, timestep: Tensor, of_condition: list[Tensor]) -> Tensor:
-        """Call the network once on noisy actions [B, predicted, 4] at timesteps [B]."""
-        of_timestep = self.unet.film_of_timestep(timestep)
-        films = [a + b for a, b in zip(of_timestep, of_condition, strict=True)]
-        prediction: Tensor = self.unet(noisy, films)
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """Call the network once on noisy actions [B, predicted, 4] at timesteps [1] or [B]."""
+        features, states = self.network_inputs(feature, state)
+        condition = torch.cat([states, features.flatten(2)], dim=-1).flatten(1)
+        prediction: Tensor = self.unet(noisy, timestep, condition)
         return prediction
 
-    def act(self, feature: Tensor, state: Tensor, num_diffusion_steps: int) -> Tensor:
-        """Run a whole solve; return the actions from now on [B, horizon, 4]."""
-        of_condition = self.film_of_condition(feature, state)
-        sample = self.initial_noise.expand(feature.shape[0], -1, -1)
-        for step in self.schedule.ddim_steps(num_diffusion_steps):
-            timestep = torch.full((1,), float(step.timestep), device=sample.device)
-            output = self.denoise(sample, timestep, of_condition)
-            sample = self.schedule.ddim_update(step, sample, output)
-        return self.from_now(sample)
+    predict_fast = predict_by_steps
 
-    def from_now(self, sample: Tensor) -> Tensor:
-        """Drop the actions of the earlier observations: [B, predicted, 4] -> [B, horizon, 4]."""
-        return sample[:, self.steps_before_now :]
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """Convert the end of a solve [B, predicted, 4] to a chunk [B, horizon, 4].
+
+        The actions of the earlier observations are dropped.
+        """
+        return self.in_units(sample[:, self.steps_before_now :])
 
 
 def _betas(config: DiffusionConfig) -> Tensor:

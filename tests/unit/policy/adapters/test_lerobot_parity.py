@@ -94,8 +94,8 @@ def test_actions_are_those_of_lerobot(golden):
     case, expected, policy, cameras = golden
     image, state = inputs(policy, expected, cameras)
     if case.startswith("diffusion"):
-        shape = policy.net.initial_noise.shape
-        policy.net.initial_noise.copy_(torch.from_numpy(formula.drawn("noise", tuple(shape))))
+        shape = policy.initial_noise.shape
+        policy.initial_noise.copy_(torch.from_numpy(formula.drawn("noise", tuple(shape))))
     steps = 7 if case == "diffusion_sample" else 4
     actions = policy.predict(image, state, torch.zeros(len(image), 4, 4), steps).numpy()
     wanted = in_contract_units(expected["actions"])
