@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -48,18 +47,11 @@ MAX_ANSWER_BYTES = 16 * 2**20
 UNAUTHORIZED = (401, 403)
 
 
-class Answer(NamedTuple):
-    """Message of the server, and the time from its request to its arrival."""
-
-    data: bytes | str
-    round_trip_s: float
-
-
 @dataclass(frozen=True, slots=True)
 class _Request:
     payload: bytes
     patience_s: float
-    answer: Future[Answer]
+    answer: Future[bytes | str]
 
 
 class ServerLink:
@@ -79,6 +71,8 @@ class ServerLink:
         self._next: _Request | None = None
         self._sent: _Request | None = None
         self._pause_s = FIRST_PAUSE_S
+        self.round_trip_s = 0.0
+        """Time from the newest answered request to its answer."""
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._hold()), name="mavbridge-server-link", daemon=True
         )
@@ -88,7 +82,7 @@ class ServerLink:
         self._thread.start()
         return self._metadata.result(2 * CONNECT_S + CLOSE_S + JOIN_S)
 
-    def ask(self, payload: bytes, timeout_s: float) -> Answer:
+    def ask(self, payload: bytes, timeout_s: float) -> bytes | str:
         """Send a request and wait for its answer."""
         if self._problem is not None:
             raise NoChunkError(self._problem)
@@ -185,7 +179,8 @@ class ServerLink:
             data = await connection.recv()
         self._sent = None
         self._pause_s = FIRST_PAUSE_S
-        request.answer.set_result(Answer(data, self._loop.time() - sent_s))
+        self.round_trip_s = self._loop.time() - sent_s
+        request.answer.set_result(data)
 
     async def _require_silence(self, connection: ClientConnection) -> None:
         """Raise PolicyError if a message arrived before the request: it is not an answer."""
@@ -259,10 +254,6 @@ class RemotePolicy:
         self._timeout_s = TRIAL_S
         self._has_begun = False
         """True if a flight has begun and the server has not been told."""
-        self.round_trip_s = 0.0
-        """Time from the newest request to its answer."""
-        self.infer_s: float | None = None
-        """The server's own share of the round trip, as it reports it."""
 
     def predict(
         self,
@@ -273,15 +264,15 @@ class RemotePolicy:
     ) -> FloatArray:
         """Ask the server for a chunk; the server sets the number of diffusion steps."""
         sample = self._interface, image[0], state[0], action_history[0]
-        message = to_message(*sample, is_ours=self._is_ours, delay_s=self.round_trip_s)
+        message = to_message(*sample, is_ours=self._is_ours, delay_s=self._link.round_trip_s)
         if self._is_ours and self._has_begun:
             message[RESET_KEY] = True
-        answer = self._link.ask(pack(message), self._timeout_s)
-        self._has_begun, self.round_trip_s = False, answer.round_trip_s
-        if isinstance(answer.data, str):
-            raise NoChunkError(f"the policy server failed: {last_line(answer.data)}")
+        data = self._link.ask(pack(message), self._timeout_s)
+        self._has_begun = False
+        if isinstance(data, str):
+            raise NoChunkError(f"the policy server failed: {last_line(data)}")
         try:
-            return self._chunk(unpack(answer.data))
+            return self._chunk(unpack(data))
         except MessageError as error:
             raise NoChunkError(f"the policy server's answer is {error}") from error
 
@@ -301,16 +292,12 @@ class RemotePolicy:
         history = np.zeros((1, *contract.history_shape), np.float32)
         for _ in range(2):  # the first one may compile
             self.predict(image, level_state(contract), history, 1)
-        share = "" if self.infer_s is None else f", {1e3 * self.infer_s:.1f} ms of them its own"
         return (
-            f"the policy server answers in {1e3 * self.round_trip_s:.1f} ms{share}; what takes "
+            f"the policy server answers in {1e3 * self._link.round_trip_s:.1f} ms; what takes "
             f"longer than {1e3 * answer_deadline_s(contract):.0f} ms is not flown"
         )
 
     def _chunk(self, message: Message) -> FloatArray:
-        timing = message.get("server_timing")
-        infer_ms = timing.get("infer_ms") if isinstance(timing, dict) else None
-        self.infer_s = 1e-3 * infer_ms if isinstance(infer_ms, int | float) else None
         own_key = self._interface.action_key
         actions = number_array(message, own_key if own_key in message else ACTIONS_KEY)
         if actions.ndim == 3 and actions.shape[0] == 1:
