@@ -22,7 +22,7 @@ from sitl.ardupilot.rc import (
 from sitl.clock import NS_PER_S
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
-from sitl.vehicle.firmware import STOPPED, Autopilot, HeldGesture, Severity
+from sitl.vehicle.firmware import STOPPED, Autopilot, Held, Severity
 from sitl.vehicle.rotation import cos_tilt
 
 LOW_READS_TO_FAIL = 3
@@ -121,7 +121,7 @@ class ArduCopter(Autopilot):
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
         self._mode_switch = ModeSwitch()
-        self._gesture = HeldGesture(GESTURE_NS)
+        self._gesture = Held(GESTURE_NS)
         self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
-from sitl.vehicle.firmware import Receiver
+from sitl.vehicle.firmware import Held, Receiver
 
 CHANNELS = 16
 PRIMARY_CHANNELS = 8  # 0 and the highest values mean something else on channels 9-16
@@ -20,7 +20,10 @@ RELEASE_ON_AUX = 65534  # releases channels 9-16; an ordinary value on 1-8
 RELEASE = 0  # releases channels 1-8; means "ignore" on 9-16
 AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 
+DEBOUNCE_NS = NS_PER_S // 5
 _OPTION_OVERRIDE_SWITCH = 46
+_SWITCH_PERIOD_NS = NS_PER_S // 10
+"""Period of reading the override switch: a flip acts after 0.2 to 0.3 s (measured: 0.38 s)."""
 _OPTIONS_IGNORE_RECEIVER = 1
 _OPTIONS_IGNORE_OVERRIDES = 2
 
@@ -38,7 +41,9 @@ class RcEngine:
         self._override_us = [RELEASE] * CHANNELS
         self._override_ns = [0] * CHANNELS
         self._fresh_override = self._was_overridden = False
-        self._switch = _OverrideSwitch()
+        self._switch = Held(DEBOUNCE_NS)  # RCn_OPTION 46: 1 high, -1 low
+        self._switch_due_ns = 0
+        self._takes_overrides = True
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
 
@@ -120,33 +125,29 @@ class RcEngine:
         return receiver_us[index] if index < len(receiver_us) else 0
 
     def _set(self, index: int, value_us: int, now_ns: int) -> None:
-        if not self._switch.enabled:
+        if not self._takes_overrides:
             return
         self._override_us[index] = value_us
         self._override_ns[index] = now_ns
         self._fresh_override = self._was_overridden = True
 
     def _watch_switch(self, now_ns: int) -> None:
+        """Read the override switch: high allows overrides, low forbids them, the middle changes
+        nothing."""
         for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):
             if self._params.integer(f"RC{channel}_OPTION") == _OPTION_OVERRIDE_SWITCH:
-                if self._switch.update(self.channels_us[channel - 1], now_ns):
-                    self.clear_overrides()
-                return
-
-
-class _Debounce:
-    """Time for which a switch has been in its present position."""
-
-    _HOLD_NS = NS_PER_S // 5
-
-    def __init__(self) -> None:
-        self._position: int | None = None
-        self._since_ns = 0
-
-    def has_settled(self, position: int, now_ns: int) -> bool:
-        if position != self._position:
-            self._position, self._since_ns = position, now_ns
-        return now_ns - self._since_ns >= self._HOLD_NS
+                break
+        else:
+            return
+        if now_ns < self._switch_due_ns:
+            return
+        self._switch_due_ns = now_ns + _SWITCH_PERIOD_NS
+        pwm_us = self.channels_us[channel - 1]
+        self._switch.see((1800 < pwm_us < 2200) - (900 < pwm_us < 1200), now_ns)
+        if side := self._switch.take(now_ns):
+            self._takes_overrides = side > 0
+        if side < 0:
+            self.clear_overrides()
 
 
 class ModeSwitch:
@@ -156,42 +157,18 @@ class ModeSwitch:
 
     def __init__(self) -> None:
         self.position: int | None = None
-        self._debounce = _Debounce()
+        self._held = Held(DEBOUNCE_NS)
 
     def update(self, pwm_us: int, now_ns: int) -> int | None:
         """Return the position, 1..6, when it has just changed; None otherwise and for the first."""
         if not 900 < pwm_us < 2200:
             return None
-        position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
-        if not self._debounce.has_settled(position, now_ns) or position == self.position:
+        self._held.see(1 + bisect_left(self._HIGHEST_US, pwm_us), now_ns)
+        position = self._held.take(now_ns)
+        if position in (0, self.position):
             return None
         before, self.position = self.position, position
         return None if before is None else position
-
-
-class _OverrideSwitch:
-    """RCn_OPTION 46: high allows overrides, low forbids them, the middle changes nothing.
-
-    Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (measured: 0.38 s).
-    """
-
-    _PERIOD_NS = NS_PER_S // 10
-
-    def __init__(self) -> None:
-        self.enabled = True
-        self._due_ns = 0
-        self._debounce = _Debounce()
-
-    def update(self, pwm_us: int, now_ns: int) -> bool:
-        """Return True if overrides have just been forbidden."""
-        if now_ns < self._due_ns:
-            return False
-        self._due_ns = now_ns + self._PERIOD_NS
-        position = (1800 < pwm_us < 2200) - (900 < pwm_us < 1200)
-        if not self._debounce.has_settled(position, now_ns) or position == 0:
-            return False
-        was_enabled, self.enabled = self.enabled, position > 0
-        return was_enabled and not self.enabled
 
 
 THROTTLE_FULL = 1000.0

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-from sitl.vehicle.firmware import HeldGesture
+from sitl.vehicle.firmware import Held
 from sitl.vehicle.rotation import Vec3, length
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
@@ -94,7 +94,7 @@ class StickInput:
         self._never_ages = False
         self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         self._looked_ns = 0
-        self.gesture = HeldGesture(GESTURE_NS)
+        self.gesture = Held(GESTURE_NS)
         """Arming gesture (throttle down, full right yaw, no lean) and disarming (full left yaw)."""
 
     @property

@@ -55,25 +55,25 @@ class VelocitySetpoint(NamedTuple):
     yaw_rate_radps: float
 
 
-class HeldGesture:
-    """Stick gesture to one of two sides, 1 or -1, that acts once after it was held."""
+class Held:
+    """Stick gesture or switch whose position, not 0, acts once after it was held."""
 
     def __init__(self, hold_ns: int) -> None:
         self._hold_ns = hold_ns
-        self._side = 0
+        self._position = 0
         self._since_ns: int | None = None
 
-    def see(self, side: int, now_ns: int) -> None:
-        """Note the present side; 0: no gesture."""
-        if side != self._side:
-            self._side, self._since_ns = side, now_ns
+    def see(self, position: int, now_ns: int) -> None:
+        """Note the present position; 0: none."""
+        if position != self._position:
+            self._position, self._since_ns = position, now_ns
 
     def take(self, now_ns: int) -> int:
-        """Return the side, once, when it has been held long enough; else 0."""
-        if not self._side or self._since_ns is None or now_ns - self._since_ns < self._hold_ns:
+        """Return the position, once, when it has been held long enough; else 0."""
+        if not self._position or self._since_ns is None or now_ns - self._since_ns < self._hold_ns:
             return 0
         self._since_ns = None
-        return self._side
+        return self._position
 
 
 class Receiver:
