@@ -1,10 +1,10 @@
 """Timing of one encoded image and one sampled chunk per engine, in one thread, without other
 load."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from rich.table import Table
@@ -19,7 +19,7 @@ from policy.errors import PolicyError
 
 EAGER: Engine = "torch"
 FAST: Engine = "openvino"
-ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
+ENCODE, CHUNK = "encode one image", "sample one chunk"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +33,10 @@ class EngineTiming:
     p99_ms: float
 
 
-class _Case(NamedTuple):
-    policy: str
-    work: str
-    engine: str
-    call: Callable[[], object]
-    durations: Histogram
-
-
 def time_engines(
     policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
 ) -> tuple[EngineTiming, ...]:
-    """Time each policy on its engine.
+    """Time each two-rate policy on its engine.
 
     Each round times every case for ``block_s``, so that a slow minute of the host affects all.
 
@@ -53,51 +45,40 @@ def time_engines(
     """
     torch.set_num_threads(1)
     clock = MonotonicClock()
-    cases: list[_Case] = []
+    took: defaultdict[tuple[str, str, str], Histogram] = defaultdict(Histogram)
     with ExitStack() as lives:
-        for policy in policies:
-            cases += _cases(policy, lives)
+        cases = [
+            (took[policy.policy, work, policy.engine], call)
+            for policy in policies
+            for work, call in _works(policy, lives)
+        ]
         for number in range(rounds):
             print_status(f"engines, round {number + 1} of {rounds}")
-            for case in cases:
-                case.call()  # warms the caches that other cases have evicted
+            for durations, call in cases:
+                call()  # warms the caches that other cases have evicted
                 end_ns = clock.now_ns() + round(block_s * NS_PER_S)
-                while (start_ns := clock.now_ns()) < end_ns or not case.durations.count:
-                    case.call()
-                    case.durations.add(clock.now_ns() - start_ns)
-    return tuple(map(_timing, cases))
+                while (start_ns := clock.now_ns()) < end_ns or not durations.count:
+                    call()
+                    durations.add(clock.now_ns() - start_ns)
+    return tuple(_timing(*case, durations) for case, durations in took.items())
 
 
-def _cases(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
+def _works(policy: PolicyConfig, lives: ExitStack) -> Iterator[tuple[str, Callable[[], object]]]:
     loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
     runner = loaded.runner
-    if policy.engine != "auto" and not runner.engine.startswith(policy.engine):
+    if not runner.engine.startswith(policy.engine):
         raise PolicyError("; ".join(loaded.notes))  # reason why the engine was not used
-    contract = runner.contract
-    images, state, history = dummy_sample(contract)
-    image = images.reshape(-1, *contract.picture_shape)[0]
+    images, state, history = dummy_sample(runner.contract)
+    image = images.reshape(-1, *runner.contract.picture_shape)[0]
     feature = encode_all(runner, images)
-    works: dict[str, Callable[[], object]] = {
-        ENCODE: lambda: runner.encode(image),
-        CHUNK: lambda: runner.act(feature, state, history),
-    }
-    if not runner.dual_rate:
-        works = {BOTH: lambda: runner.act(encode_all(runner, images), state, history)}
-    engine = runner.engine if policy.engine == "auto" else policy.engine
-    name = policy.policy
-    return [_Case(name, work, engine, call, Histogram()) for work, call in works.items()]
+    yield ENCODE, lambda: runner.encode(image)
+    yield CHUNK, lambda: runner.act(feature, state, history)
 
 
-def _timing(case: _Case) -> EngineTiming:
-    percentiles = case.durations.percentiles_ms()
-    assert percentiles is not None  # each block times one call at least
-    return EngineTiming(
-        policy=case.policy,
-        work=case.work,
-        engine=case.engine,
-        p50_ms=percentiles.p50,
-        p99_ms=percentiles.p99,
-    )
+def _timing(policy: str, work: str, engine: str, durations: Histogram) -> EngineTiming:
+    took = durations.percentiles_ms()
+    assert took is not None  # each block times one call at least
+    return EngineTiming(policy=policy, work=work, engine=engine, p50_ms=took.p50, p99_ms=took.p99)
 
 
 def engine_table(timings: Iterable[EngineTiming]) -> Table:
