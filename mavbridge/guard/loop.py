@@ -67,6 +67,7 @@ class GuardLoop:
         samples: Port | None = None,
         received: Sequence[bytes] = (),
         lead_ns: int = 0,
+        watch_input: Callable[[int, GuardInput], object] = lambda at_ns, given: None,
     ) -> None:
         """Connect the link and the flight process.
 
@@ -77,8 +78,10 @@ class GuardLoop:
             samples: port for the vehicle's readings; None: send them through ``flight``.
             received: messages already received from the flight process.
             lead_ns: time from the start of a computation to its slot; the send waits for the slot.
+            watch_input: called with the time and the input of each step of the guard.
         """
         self._received = list(received)
+        self._watch_input = watch_input
         self._lead_ns = lead_ns
         self._clock = clock
         self._link = link
@@ -198,6 +201,7 @@ class GuardLoop:
         if not self._has_work(snapshot, given, at_ns, slot_ns):
             self._link.service()
             return self._guard.next_ns - self._lead_ns
+        self._watch_input(at_ns, given)
         output = self._guard.step(at_ns, given)
         if isinstance(output.decision, Command):
             self._link.send_before_action()

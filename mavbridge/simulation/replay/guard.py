@@ -17,7 +17,6 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
-from mavbridge.core.vehicle import LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
@@ -58,17 +57,9 @@ class GuardStep:
     recorded: Tick
     replayed: GuardTick | None
     """None: the replayed pass neither sent nor reported."""
-    snapshot: LinkSnapshot
-    """The link's snapshot of that pass."""
-    chunk_serial: int | None
-    """Chunk that the guard got in this pass."""
-    act: OperatorCommand | None
-    stop: EndRequest | None
-    told: tuple[tuple[int, Reason], ...]
-    """When and why the guard was told, since the step before, that there is no usable chunk."""
-    passes: tuple[tuple[int, LinkSnapshot], ...]
-    """Passes since the step before, on the way into a flight: such a pass has no tick, but it may
-    ask the vehicle, whose answer comes before the next slot."""
+    given: tuple[tuple[int, GuardInput], ...]
+    """Times and inputs of the guard's steps since the pass before; the last is that of this pass.
+    On the way into a flight, and for an absence, a pass has no tick of its own."""
 
 
 def unrepeatable(ticks: Sequence[Tick]) -> Iterator[str]:
@@ -93,7 +84,8 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     transport = _RecordedTransport(clock, source.packets, source.requested_ns)
     link = _link(source, clock, transport)
     port = _RecordedPort(clock)
-    loop = GuardLoop(clock, link, port)
+    given: list[tuple[int, GuardInput]] = []
+    loop = GuardLoop(clock, link, port, watch_input=lambda *step: given.append(step))
     settings = recorded_plan(source).guard
     port.inbox.append(encode_to_guard(settings))
     # The grid begins when the guard gets its settings.
@@ -102,24 +94,20 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     codes: tuple[Code, ...] = ()
     absences = deque(_absences(source, settings.chunk_period_ns))
     for tick, chunk, act, stop in _arrivals(source):
-        at_ns, told = tick.decided_ns or tick.woke_ns, []
+        at_ns = tick.decided_ns or tick.woke_ns
         absence: Reason | None = None
         while absences and absences[0][0] <= at_ns:
             told_ns, absence = absences.popleft()
             if told_ns < at_ns:
                 _keep_link(link, clock, transport, min(told_ns, tick.woke_ns, tick.due_ns - 1))
                 told_ns = clock.now_ns()
-            told.append((told_ns, absence))
             if told_ns < tick.due_ns:  # else in the pass of the tick
                 port.inbox.append(encode_to_guard(absence))
                 loop.step()
                 absence = None
-        passes: list[tuple[int, LinkSnapshot]] = []
         if steps and steps[-1].recorded.phase == tick.phase == Phase.PREPARING.value:
-            until_ns = min(tick.woke_ns, tick.due_ns)
-            for _ in _arrived(link, clock, transport, until_ns):
+            for _ in _arrived(link, clock, transport, min(tick.woke_ns, tick.due_ns)):
                 loop.step()
-                passes.append((clock.now_ns(), link.newest))
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = at_ns, tick.sent_ns
         is_neutral_refused = source.meta.keeps_neutral and tick.lacks_neutral
@@ -129,18 +117,8 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
         messages: tuple[ToGuard | None, ...] = (chunk, absence, act, stop)
         port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
-        steps.append(
-            GuardStep(
-                recorded=tick,
-                replayed=port.take_tick(),
-                snapshot=link.newest,
-                chunk_serial=chunk.serial if chunk else None,
-                act=act,
-                stop=stop,
-                told=tuple(told),
-                passes=tuple(passes),
-            )
-        )
+        steps.append(GuardStep(recorded=tick, replayed=port.take_tick(), given=tuple(given)))
+        given.clear()
     return steps
 
 
@@ -176,30 +154,21 @@ def replay_other(
     steps: Sequence[GuardStep],
     settings: FlightSettings,
     chunks: Mapping[int, Chunk],
-) -> Iterator[GuardTick]:
-    """Replay other chunks or settings through the guard. Yield one tick for each of ``steps``.
+) -> Iterator[GuardTick | None]:
+    """Replay other chunks or settings through the guard. Yield the tick of each of ``steps``; None
+    where the guard had nothing to do.
 
     The vehicle's answers are those to the recorded sticks, so the link is not run; its recorded
     snapshots are used. The resulting sticks are those of the policy's trace, before the message.
     """
     first = steps[0].recorded
-    origin_ns = first.due_ns - first.index * settings.stick_period_ns
-    guard = Guard(settings, origin_ns)
+    guard = Guard(settings, first.due_ns - first.index * settings.stick_period_ns)
     for step in steps:
-        chunk = None if step.chunk_serial is None else chunks.get(step.chunk_serial)
-        at_ns = step.recorded.decided_ns or step.recorded.woke_ns
-        absence: Reason | None = None
-        for passed_ns, snapshot in step.passes:
-            guard.step(passed_ns, GuardInput(link=snapshot))
-        for told_ns, reason in step.told:
-            if told_ns < step.recorded.due_ns:
-                guard.step(told_ns, GuardInput(link=step.snapshot, absence=reason))
-            else:
-                absence = reason
-        given = GuardInput(
-            link=step.snapshot, chunk=chunk, absence=absence, act=step.act, stop=step.stop
-        )
-        yield guard.step(at_ns, given).tick
+        tick: GuardTick | None = None
+        for at_ns, given in step.given:
+            chunk = None if given.chunk is None else chunks.get(given.chunk.serial)
+            tick = guard.step(at_ns, replace(given, chunk=chunk)).tick
+        yield tick
 
 
 def _arrivals(
@@ -284,20 +253,9 @@ def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
     return None
 
 
-class _WatchedLink(MavlinkLink):
-    """Link that keeps its last snapshot for the guard."""
-
-    newest: LinkSnapshot
-
-    def snapshot(self) -> LinkSnapshot:
-        """See ``MavlinkLink``."""
-        self.newest = super().snapshot()
-        return self.newest
-
-
 def _link(
     source: ReplaySource, clock: SteppedClock, transport: "_RecordedTransport"
-) -> _WatchedLink:
+) -> MavlinkLink:
     config: FlyConfig = source.config
     # Use the settings from before a policy was loaded, as when the guard started.
     loops = config.rates.loops(is_dual=source.meta.mode == "dual")
@@ -307,7 +265,7 @@ def _link(
         stick_hz=config.rates.stick_rate + loops.action_hz,
         min_battery_percent=config.envelope.min_battery,
     )
-    return _WatchedLink(transport, clock, replace(settings, known_params=source.known_params))
+    return MavlinkLink(transport, clock, replace(settings, known_params=source.known_params))
 
 
 class _RecordedTransport(Transport):
