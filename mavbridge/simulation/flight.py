@@ -26,7 +26,6 @@ from mavbridge.simulation.referee import RUN_OUT_S, EpisodeResult, Referee
 from mavbridge.simulation.world import (
     MOUNTS,
     NOMINAL_VEHICLE,
-    BlankRenderer,
     DelayedFeatureCache,
     DelayedSink,
     Exposure,
@@ -229,13 +228,14 @@ class SimulatedFlight:
         width = max(contract.image_width, settings.least_camera_px)
         height = max(contract.image_height, settings.least_camera_px)
         every_ns = period_ns(camera_hz)
+        black = np.zeros((height, width, 3), np.uint8)
         cameras = [
             SimulatedCamera(
                 self.clock,
                 lambda: self.vehicle.pose,
-                FpvRenderer(self.course, width, height, conditions)
+                FpvRenderer(self.course, width, height, conditions).render
                 if settings.draw_images
-                else BlankRenderer(width, height),
+                else lambda *_pose: black,
                 period_ns=every_ns,
                 phase_ns=int(self._random(10 * number + 2).integers(every_ns)),
                 delays_ns=settings.delays.camera.samples_ns(self._random(10 * number + 3)),

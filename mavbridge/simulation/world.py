@@ -7,8 +7,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from mavbridge.config.episodes import ConditionsKind
 from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, TickSink, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
@@ -16,7 +14,6 @@ from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel
 from policy.contract import Contract
 from sitl.ardupilot.guided import OPTION_THRUST
-from sitl.camera.fpv import FpvRenderer
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
@@ -70,19 +67,6 @@ def needed_params(contract: Contract, autopilot: AutopilotName) -> dict[str, flo
     return {"GUID_OPTIONS": OPTION_THRUST} if has_thrust and autopilot == "ardupilot" else {}
 
 
-class BlankRenderer:
-    """Replacement of ``FpvRenderer`` for flights without images: black, at no cost."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self._black = np.zeros((height, width, 3), np.uint8)
-
-    def render(
-        self, position_ned_m: Vec3, ned_from_body_wxyz: Quat, rate_body_radps: Vec3
-    ) -> ImageArray:
-        """Return black [H, W, 3] uint8, always the same array."""
-        return self._black
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exposure:
     """True state of the vehicle at the exposure of a frame."""
@@ -128,14 +112,15 @@ class SimulatedCamera:
     """``ports.Camera`` on the vehicle; a frame is drawn when read, from the pose at exposure.
 
     As in ``sitl``, a frame shows the vehicle's last step and carries that step's stamp, which is
-    the middle of the frame. The frame ends ``to_end_ns`` later, and arrives after that.
+    the middle of the frame. The frame ends ``to_end_ns`` later, and arrives after that. ``render``
+    draws [H, W, 3] uint8 from position, attitude and body rates of the camera.
     """
 
     def __init__(
         self,
         clock: SteppedClock,
         pose: Callable[[], Pose],
-        renderer: FpvRenderer | BlankRenderer,
+        render: Callable[[Vec3, Quat, Vec3], ImageArray],
         *,
         period_ns: int,
         phase_ns: int,
@@ -149,7 +134,7 @@ class SimulatedCamera:
         self._to_end_ns = to_end_ns
         self._mount = mount
         self._pose = pose
-        self._renderer = renderer
+        self._render = render
         self._period_ns = period_ns
         self._delays_ns = delays_ns
         self._arrived: Exposure | None = None
@@ -191,7 +176,7 @@ class SimulatedCamera:
         if self._mount != IDENTITY:
             attitude = multiply(attitude, self._mount)
             rate_mount_radps = rotate(conjugate(self._mount), rate_mount_radps)
-        rgb = self._renderer.render(body.position_ned_m, attitude, rate_mount_radps)
+        rgb = self._render(body.position_ned_m, attitude, rate_mount_radps)
         rgb.setflags(write=False)
         return Frame(frame_id=exposure.frame_id, captured_ns=exposure.captured_ns, rgb=rgb)
 

@@ -38,7 +38,7 @@ def camera(**settings: Any) -> tuple[SteppedClock, SimulatedCamera, Renderer]:
     made = SimulatedCamera(
         clock,
         lambda: Pose(stamp_ns=clock.now_ns(), body=BODY),
-        renderer,  # type: ignore[arg-type]
+        renderer.render,
         period_ns=100 * NS_PER_MS,
         phase_ns=0,
         delays_ns=repeat(3 * NS_PER_MS),
