@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mavbridge.camera.open import BlankCamera
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
+from mavbridge.core.records import FeatureFrame, FloatArray, Solve, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
@@ -86,12 +87,13 @@ class _Loop:
         span_ns = observation_ages_ns(runner.contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
         plan = plan_flight(source.config, runner.contract, is_dual=runner.dual_rate)
+        unread = BlankCamera(image_size=(1, 1), clock=clock)  # the features are recorded
         bridge = build_bridge(
             plan,
             replace(runner, act=self._timed_act),
             clock=clock,
             send=self._sent,
-            cameras=[CameraPath(camera=_NoCamera(), cache=c, clock=clock) for c in self.caches],
+            cameras=[CameraPath(camera=unread, cache=c, clock=clock) for c in self.caches],
             sinks=(),
             watches_images=False,
             watch_solve=self._keep,
@@ -126,19 +128,6 @@ class _Loop:
 
     def _keep(self, solve: Solve) -> None:
         self._solve = solve
-
-
-class _NoCamera:
-    """``Camera`` that is never read: the features are recorded."""
-
-    dropped_frames = 0
-
-    def read(self, timeout_ns: int) -> Frame | None:
-        """Return None."""
-        return None
-
-    def close(self) -> None:
-        """No-op."""
 
 
 class _Shelf:
