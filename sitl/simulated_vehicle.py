@@ -14,7 +14,7 @@ from sitl.px4.autopilot import Px4
 from sitl.px4.params import Px4Params
 from sitl.px4.server import Px4Server
 from sitl.report import FlightLog
-from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.config import DEFAULT_VEHICLE, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
 from sitl.vehicle.firmware import Autopilot, Severity
 
@@ -41,20 +41,14 @@ class SimulatedVehicle:
         config: VehicleConfig | None = None,
         course: Course | None = None,
     ) -> None:
-        self._config = config = config or VehicleConfig()
+        self._config = config = config or DEFAULT_VEHICLE
         self.log = FlightLog(boot_ns, course)
         self.params: ArduPilotParams | Px4Params
         """The firmware's parameters; they survive a reboot."""
         self.ap: Autopilot  # the flight controller since its last boot
         self.server: MavlinkServer[Any, Any]  # the vehicle's links
-        if config.autopilot == "px4":
-            self.params = Px4Params(
-                config.conditions,
-                receiver=config.receiver_us is not None,
-                release=config.px4_release,
-            )
-        else:
-            self.params = ArduPilotParams(config.conditions, config.ardupilot_release)
+        is_px4 = config.autopilot == "px4"
+        self.params = Px4Params(config) if is_px4 else ArduPilotParams(config)
         self._boot(links, boot_ns)
         self._transmitter_us: Sequence[int] | None = None
         self.pose = Pose(stamp_ns=boot_ns, body=self.ap.truth)

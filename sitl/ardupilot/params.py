@@ -7,8 +7,8 @@ Values that vary between vehicles come from the conditions; their nominal attitu
 limits are this vehicle's tuning, not the firmware's defaults.
 """
 
-from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.config import ArduPilotRelease
+from sitl.vehicle.conditions import Conditions
+from sitl.vehicle.config import DEFAULT_VEHICLE, VehicleConfig
 from sitl.vehicle.firmware import Params, float32
 
 RC_CHANNELS_WITH_PARAMS = 8
@@ -87,17 +87,15 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 class ArduPilotParams(Params):
     """ArduPilot's parameters; `on_wire` and `set_on_wire` use the names of the release."""
 
-    def __init__(
-        self, conditions: Conditions = NOMINAL, release: ArduPilotRelease = "4.7-dev"
-    ) -> None:
-        values = _FIXED | _varied(conditions)
-        dead_zones_us = conditions.rc_dead_zones_us
+    def __init__(self, config: VehicleConfig = DEFAULT_VEHICLE) -> None:
+        values = _FIXED | _varied(config.conditions)
+        dead_zones_us = config.conditions.rc_dead_zones_us
         for index in range(RC_CHANNELS_WITH_PARAMS):
             dead_zone_us = dead_zones_us[index] if index < len(dead_zones_us) else 0.0
             channel = {**_RC_CHANNEL, "DZ": dead_zone_us}
             values |= {f"RC{index + 1}_{name}": value for name, value in channel.items()}
-        renamed = _NAMES_4_6 if release == "4.6" else {}
-        if release == "4.6":
+        renamed = _NAMES_4_6 if config.ardupilot_release == "4.6" else {}
+        if renamed:
             del values["MAV_GCS_SYSID_HI"]
         super().__init__(values)
         named = {renamed.get(name, name): name for name in self._values}

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.config import Px4Release
+from sitl.vehicle.config import DEFAULT_VEHICLE, Px4Release, VehicleConfig
 from sitl.vehicle.firmware import Params, float32
 
 DEAD_ZONE = "MAN_DEADZONE"
@@ -111,19 +111,13 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 class Px4Params(Params):
     """PX4's parameters of one release."""
 
-    def __init__(
-        self,
-        conditions: Conditions = NOMINAL,
-        *,
-        receiver: bool = False,
-        release: Px4Release = "1.18",
-    ) -> None:
-        """Set the release's defaults. ``receiver``: map four channels in the usual order."""
-        values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(conditions)}
-        for name in _ABSENT[release]:
+    def __init__(self, config: VehicleConfig = DEFAULT_VEHICLE) -> None:
+        """Set the release's defaults; with a receiver, map four channels in the usual order."""
+        values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(config.conditions)}
+        for name in _ABSENT[config.px4_release]:
             del values[name]
         values |= {} if DEAD_ZONE in values else _OLD_NAMES
-        if receiver:
+        if config.receiver_us is not None:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
         super().__init__(values, _INTEGERS)
 

@@ -51,3 +51,6 @@ class VehicleConfig:
     """Sign all messages, and refuse those not signed with this key."""
     conditions: Conditions = NOMINAL
     """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` uses those of the camera."""
+
+
+DEFAULT_VEHICLE = VehicleConfig()

@@ -8,6 +8,7 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine, climb_rate_mps, lean_angles, read_sticks, yaw_rate_radps
 from sitl.vehicle.conditions import Conditions
+from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.firmware import Receiver
 
 PX4_DEFAULTS = {
@@ -54,7 +55,7 @@ def copter_values(**changed: float) -> dict[str, float]:
 
 def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
     """Return the motion of the simulated copter's own code for these sticks, as PWM on the wire."""
-    params = ArduPilotParams(conditions)
+    params = ArduPilotParams(VehicleConfig(conditions=conditions))
     channels = calibration({name: params[name] for name in params.names})
     rc = RcEngine(params, Receiver(None))
     for channel, pwm_us in zip(channels.channels, channels.to_pwm_us(sticks), strict=True):

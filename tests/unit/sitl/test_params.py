@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.px4.params import Px4Params
+from sitl.vehicle.config import VehicleConfig
 
 BOTH = pytest.mark.parametrize(
     ("make", "seconds"), [(ArduPilotParams, "RC_OVERRIDE_TIME"), (Px4Params, "COM_OF_LOSS_T")]
@@ -42,7 +43,7 @@ def test_unknown_names_and_values_beyond_float32_are_refused(make, seconds):
     ],
 )
 def test_a_release_answers_to_its_own_names_alone(release, present, absent):
-    names = ArduPilotParams(release=release).names
+    names = ArduPilotParams(VehicleConfig(ardupilot_release=release)).names
     assert set(present) <= set(names)
     assert absent not in names
     assert len(set(names)) == len(names) == len(ArduPilotParams().names) - (release == "4.6")

@@ -12,6 +12,7 @@ from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.vehicle.conditions import Conditions
+from sitl.vehicle.config import VehicleConfig
 
 GAINS = StickGains()
 HALF = Conditions(angle_max_cdeg=1500.0, pilot_yaw_rate_degps=101.25, pilot_speed_up_cmps=125.0)
@@ -19,7 +20,7 @@ TWICE = Conditions(angle_max_cdeg=6000.0, pilot_yaw_rate_degps=405.0, pilot_spee
 
 
 def values_of(conditions: Conditions) -> dict[str, float]:
-    params = ArduPilotParams(conditions)
+    params = ArduPilotParams(VehicleConfig(conditions=conditions))
     return {name: params[name] for name in params.names}
 
 

@@ -42,7 +42,7 @@ NOMINAL_VIEW = [
 def fly(conditions, seconds=8.0):
     """Take off, then weave; the state at the end."""
     config = VehicleConfig(estimator_ready_s=0.0, conditions=conditions)
-    ap = ArduCopter(ArduPilotParams(conditions), config, boot_ns=0)
+    ap = ArduCopter(ArduPilotParams(config), config, boot_ns=0)
     for tick in range(round(seconds * 100)):
         t_s = tick / 100
         sticks = [1500, 1500, 1000 if t_s < 0.5 else 1800 if t_s < 3.0 else 1500, 1500]
