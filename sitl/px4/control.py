@@ -100,37 +100,6 @@ class RateController:
         )
 
 
-class VelocityController:
-    """Tracks a horizontal velocity by leaning, with proportional, integral and damping terms."""
-
-    def __init__(self, params: Px4Params) -> None:
-        self._params = params
-        self._integral = STILL
-        self._last_mps: complex | None = None
-        self._accel = STILL
-
-    def reset(self, accel_mps2: complex) -> None:
-        """Start with this acceleration in the integral, as if wind and drag required it."""
-        self._integral = accel_mps2
-        self._last_mps = None
-        self._accel = STILL
-
-    def update(self, body: BodyState, wanted_mps: complex, feedforward_mps2: complex) -> complex:
-        """Return the acceleration [m/s^2], limited by MPC_TILTMAX_AIR."""
-        params = self._params
-        actual = horizontal(body.velocity_ned_mps)
-        last, self._last_mps = self._last_mps, actual
-        change = STILL if last is None else actual - last
-        error = wanted_mps - actual
-        self._accel += 0.1 * (change / STEP_S - self._accel)
-        integral = self._integral + params["MPC_XY_VEL_I_ACC"] * error * STEP_S
-        self._integral = clamp_axes(integral, MAX_VELOCITY_INTEGRAL_MPS2)
-        damping = params["MPC_XY_VEL_D_ACC"] * self._accel
-        wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral - damping
-        limit = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_TILTMAX_AIR"]))
-        return shorten(wanted + feedforward_mps2, limit)
-
-
 class Horizontal:
     """Horizontal motion of the modes that need a position: paths and their velocity controller.
 
@@ -140,7 +109,8 @@ class Horizontal:
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
-        self._velocity = VelocityController(params)
+        self._integral = self._felt_mps2 = STILL  # of the velocity controller
+        self._last_mps: complex | None = None
         self.accel_mps2 = STILL  # last demanded acceleration
         self.speed_mps = STILL  # last demanded velocity
         self._path_accel = STILL
@@ -149,8 +119,9 @@ class Horizontal:
         self._reaction_s = 0.0
 
     def reset(self, body: BodyState, accel_mps2: complex) -> None:
-        self._velocity.reset(accel_mps2)
-        self.accel_mps2 = accel_mps2
+        """Start with this acceleration in the integral, as if wind and drag required it."""
+        self.accel_mps2 = self._integral = accel_mps2
+        self._felt_mps2, self._last_mps = STILL, None
         self.speed_mps = horizontal(body.velocity_ned_mps)
         self._path_accel = STILL
         self._place_m = None
@@ -210,8 +181,20 @@ class Horizontal:
         offset = self._params["MPC_XY_P"] * (place_m - horizontal(body.position_ned_m))
         return shorten(offset, self._params["MPC_XY_CRUISE"])
 
-    def _follow(self, velocity: complex, feedforward: complex, body: BodyState) -> complex:
-        self.accel_mps2 = self._velocity.update(body, velocity, feedforward)
+    def _follow(self, wanted_mps: complex, feedforward_mps2: complex, body: BodyState) -> complex:
+        """Return the acceleration that tracks a velocity, with proportional, integral and damping
+        terms, limited by MPC_TILTMAX_AIR."""
+        params, actual = self._params, horizontal(body.velocity_ned_mps)
+        change = STILL if self._last_mps is None else actual - self._last_mps
+        self._last_mps = actual
+        self._felt_mps2 += 0.1 * (change / STEP_S - self._felt_mps2)
+        error = wanted_mps - actual
+        integral = self._integral + params["MPC_XY_VEL_I_ACC"] * error * STEP_S
+        self._integral = clamp_axes(integral, MAX_VELOCITY_INTEGRAL_MPS2)
+        damping = params["MPC_XY_VEL_D_ACC"] * self._felt_mps2
+        wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral - damping
+        limit = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_TILTMAX_AIR"]))
+        self.accel_mps2 = shorten(wanted + feedforward_mps2, limit)
         return self.accel_mps2
 
 
