@@ -61,28 +61,24 @@ class BoundedQueue(Generic[_Item]):
 class ObserverThread:
     """A ``TickSink`` that passes events in batches to a consumer on its own thread.
 
-    Ticks and vision ticks queue separately, so images, which are large and slow to handle, drop
-    first and never push a tick out. Ticks must be emitted by one thread, solves by one, and the
-    vision ticks of each camera by one. The observer's thread is a daemon: a consumer that hangs
-    cannot keep the process alive.
+    Events are queued from the construction on, also before ``start``. Ticks and vision ticks queue
+    separately, so images, which are large and slow to handle, drop first and never push a tick out.
+    Ticks must be emitted by one thread, solves by one, and the vision ticks of each camera by one.
+    The observer's thread is a daemon: a consumer that hangs cannot keep the process alive.
     """
 
     def __init__(
         self,
         name: str,
-        consumer: Consumer,
         *,
         capacity: int,
         image_capacity: int = 16,
         cameras: int = 1,
     ) -> None:
-        """Start the thread. The consumer belongs to it from here on.
-
-        ``capacity``: most queued ticks, and most queued solves. ``image_capacity``: most queued
+        """``capacity``: most queued ticks, and most queued solves. ``image_capacity``: most queued
         vision ticks per camera.
         """
         self._name = name
-        self._consumer = consumer
         self._ticks: BoundedQueue[Observed] = BoundedQueue(capacity)
         self._solves: BoundedQueue[Observed] = BoundedQueue(capacity)
         self._visions: list[BoundedQueue[Observed]] = [
@@ -94,7 +90,12 @@ class ObserverThread:
         self.failure: str | None = None
         """Why the observer stopped before it was closed, or None."""
         self._in_flight = 0
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self, consumer: Consumer) -> None:
+        """Start the thread. The consumer belongs to it from here on."""
+        self._thread = threading.Thread(
+            target=self._run, args=(consumer,), name=self._name, daemon=True
+        )
         self._thread.start()
 
     def emit(self, event: Observed) -> None:
@@ -130,7 +131,7 @@ class ObserverThread:
             self._fail(f"did not finish within {timeout_s:g} s")
         return not self._out_of_time.is_set()
 
-    def _run(self) -> None:
+    def _run(self, consumer: Consumer) -> None:
         try:
             while not self._out_of_time.is_set():
                 is_last_round = self._closing.wait(BATCH_PERIOD_S)
@@ -139,7 +140,7 @@ class ObserverThread:
                     batch += queue.take(BATCH_EVENTS)
                 if batch:
                     self._in_flight = len(batch)
-                    self._consumer.consume(batch)
+                    consumer.consume(batch)
                     self._in_flight = 0
                 elif is_last_round:
                     return
@@ -151,7 +152,7 @@ class ObserverThread:
         finally:
             self._open = False
             try:
-                self._consumer.close()
+                consumer.close()
             except (MavbridgeError, OSError) as error:
                 self._fail(str(error))
 

@@ -119,13 +119,12 @@ class FlightObservers:
             to_ned=action_frame(contract).to_guard,
             gates=self._gates or (),
         )
-        self._viewer = ObserverThread(
-            "mavbridge-rerun",
-            RerunView(config.rerun, flight, is_live=True),
-            capacity=RERUN_CAPACITY,
-            cameras=len(contract.cameras),
+        viewer = ObserverThread(
+            "mavbridge-rerun", capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
         )
-        stack.callback(self._viewer.close, VIEWER_JOIN_S)
+        viewer.start(RerunView(config.rerun, flight, is_live=True))
+        stack.callback(viewer.close, VIEWER_JOIN_S)
+        self._viewer = viewer
 
     def open_recorder(self, guard: GuardProcess, autopilot: Callable[[], str]) -> None:
         """Start the recorder if --record is given.
@@ -158,9 +157,9 @@ class FlightObservers:
             policy_files=digests(policy_files(self._config.policy)),
             cameras=self._camera_sources(),
         )
-        self._guard = guard
+        self._guard, recorder = guard, Recorder(cameras=len(meta.contract.cameras))
         try:
-            self._recorder = Recorder(
+            recorder.begin(
                 self._config.record,
                 meta,
                 tlog_pipe=guard.tlog_pipe,
@@ -171,6 +170,7 @@ class FlightObservers:
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error
+        self._recorder = recorder
 
     def close_recorder(self, outcome: FlightOutcome | None) -> None:
         """Finish the recording. Call after the guard has ended, so that it holds the release."""

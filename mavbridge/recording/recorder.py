@@ -23,13 +23,21 @@ IMAGE_CAPACITY = 32
 
 
 class Recorder(ObserverThread):
-    """Recording of one flight while it flies.
+    """Recording of one flight while it flies, from the construction of the recorder on.
 
     Call ``close`` once the link is closed; if the link's process is still running, the writer
     process keeps its log to the end.
     """
 
-    def __init__(
+    def __init__(self, *, cameras: int = 1) -> None:
+        super().__init__(
+            "mavbridge-recorder",
+            capacity=CAPACITY,
+            image_capacity=IMAGE_CAPACITY,
+            cameras=cameras,
+        )
+
+    def begin(
         self,
         folder: Path,
         meta: FlightMeta,
@@ -40,10 +48,13 @@ class Recorder(ObserverThread):
         report: Callable[[str], None],
         settings: ReplaySettings | None = None,
     ) -> None:
-        """Create the files, start the writer process and the thread; raise OSError, WriterError.
+        """Create the files, start the writer process and the thread, which takes seconds.
 
         ``packets_dropped`` and ``autopilot`` are asked at the end; ``report`` shows a line to the
         user, from the recorder's thread. Without ``settings`` the flight cannot be replayed.
+
+        Raises:
+            OSError, WriterError: a file cannot be written, or the writer process does not start.
         """
         self._folder = folder
         writer = FlightWriter(
@@ -56,13 +67,7 @@ class Recorder(ObserverThread):
                 writer.close()
                 raise
         self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
-        super().__init__(
-            "mavbridge-recorder",
-            self._flight,
-            capacity=CAPACITY,
-            image_capacity=IMAGE_CAPACITY,
-            cameras=len(meta.contract.cameras),
-        )
+        self.start(self._flight)
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Queue the stamps of received packets, or drop and count them. For one thread only."""

@@ -1,11 +1,9 @@
 """Start and end of episodes, their folders, recorders and marks, and the room on the disk."""
 
 import os
-import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from shutil import disk_usage
 from typing import Literal, TypeAlias
@@ -16,7 +14,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
-from mavbridge.recording.recorder import CAPACITY, IMAGE_CAPACITY, Recorder
+from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 
 QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
@@ -177,10 +175,8 @@ class Episodes:
         self._autopilot = autopilot
         self._wall_offset_ns = wall_offset_ns
         self._report = report
-        self._early: dict[type[Event], list[Event]] | None = None
-        """Events that came while the writer of an episode starts, which takes seconds."""
-        self._lock = threading.Lock()
-        """Keeps events in order when the writer is there."""
+        self._recorded: Episode | None = None
+        """Episode that takes events: the current one, and before that while its recorder begins."""
         self.current: Episode | None = None
         self._last: Episode | None = None
         self._marks: dict[int, bool | None] = {}
@@ -188,13 +184,8 @@ class Episodes:
 
     def emit(self, event: Event) -> None:
         """Record the event if an episode is in progress; a ``TickSink``."""
-        with self._lock:
-            if self._early is not None:
-                early = self._early.setdefault(type(event), [])
-                if len(early) < (CAPACITY if isinstance(event, Tick) else IMAGE_CAPACITY):
-                    early.append(event)  # later ones are missed by their numbers
-            elif self.current is not None:
-                self.current.emit(event)
+        if (episode := self._recorded) is not None:
+            episode.emit(event)
 
     @property
     def number(self) -> int:
@@ -214,12 +205,15 @@ class Episodes:
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder, "--out")
-        begin_ns, self._early = self._clock.now_ns(), {}
+        begin_ns, recorder = self._clock.now_ns(), Recorder()
         try:
             pipe = open_tlog_pipe()
             log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=self._wall_offset_ns)
             pipe.writer.close()
-            recorder = Recorder(
+            episode = self._recorded = Episode(
+                folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
+            )
+            recorder.begin(
                 folder,
                 self._make_meta(begin_ns),
                 tlog_pipe=pipe,
@@ -230,18 +224,12 @@ class Episodes:
         except OSError as error:
             raise UserError(f"{folder}: {error}") from error
         self._log_to(log)
-        episode = Episode(
-            folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
-        )
-        with self._lock:
-            for event in chain.from_iterable(self._early.values()):
-                episode.emit(event)
-            self._early, self.current = None, episode
+        self.current = episode
         self._next += 1
 
     def end(self, reason: str) -> None:
         """End the current episode, mark it, and report its contents."""
-        episode, self.current = self.current, None
+        episode, self.current, self._recorded = self.current, None, None
         if episode is None:
             return
         seconds = (self._clock.now_ns() - episode.begin_ns) / NS_PER_S

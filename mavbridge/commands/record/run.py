@@ -169,8 +169,8 @@ class _Session:
     def _open_viewer(self) -> TickSink:
         rate = self._config.rate
         flight = ViewedFlight(vision_hz=self._config.visual_rate, chunk_hz=rate, stick_hz=rate)
-        view = RerunView(self._config.rerun, flight, is_live=True)
-        viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
+        viewer = ObserverThread("mavbridge-rerun", capacity=RERUN_CAPACITY)
+        viewer.start(RerunView(self._config.rerun, flight, is_live=True))
         self._stack.callback(viewer.close, JOIN_S)
         return viewer
 

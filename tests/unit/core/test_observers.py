@@ -36,9 +36,15 @@ class Recorder:
         self.closed.set()
 
 
+def observing(consumer: Recorder, **sizes: int) -> ObserverThread:
+    observer = ObserverThread("viewer", **sizes)
+    observer.start(consumer)
+    return observer
+
+
 def test_every_event_reaches_the_consumer_in_order_on_the_named_thread() -> None:
     consumer = Recorder()
-    observer = ObserverThread("viewer", consumer, capacity=1000)
+    observer = observing(consumer, capacity=1000)
     ticks = [make_tick(index) for index in range(1000)]  # more than a batch
     frames = [make_vision_tick(number) for number in range(1, 5)]
     for event in (*ticks, *frames):
@@ -55,7 +61,7 @@ def test_every_event_reaches_the_consumer_in_order_on_the_named_thread() -> None
 
 def test_images_drop_before_ticks_and_the_newest_drops() -> None:
     consumer = Recorder(held=True)
-    observer = ObserverThread("viewer", consumer, capacity=50, image_capacity=2)
+    observer = observing(consumer, capacity=50, image_capacity=2)
     observer.emit(make_tick(0))
     assert consumer.busy.wait(DEADLINE_S)  # tick 0 is in the consumer's hands: queues are empty
     for index in range(1, 51):
@@ -77,7 +83,7 @@ def test_an_expected_error_stops_the_observer_once_and_counts_the_rest(
     error: Exception, caplog: pytest.LogCaptureFixture
 ) -> None:
     consumer = Recorder(error=error, held=True)
-    observer = ObserverThread("viewer", consumer, capacity=10)
+    observer = observing(consumer, capacity=10)
     observer.emit(make_tick(0))
     assert consumer.busy.wait(DEADLINE_S)
     observer.emit(make_tick(1))  # queued while the consumer is failing on tick 0
@@ -94,7 +100,7 @@ def test_an_expected_error_stops_the_observer_once_and_counts_the_rest(
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_bug_in_the_consumer_shows_its_traceback_and_does_not_reach_the_loop() -> None:
-    observer = ObserverThread("viewer", Recorder(error=ZeroDivisionError("oops")), capacity=10)
+    observer = observing(Recorder(error=ZeroDivisionError("oops")), capacity=10)
     observer.emit(make_tick(0))
     observer.close(DEADLINE_S)
     observer.emit(make_tick(1))
@@ -108,14 +114,14 @@ def test_an_error_while_finishing_is_reported() -> None:
         def close(self) -> None:
             raise OSError("disk full")
 
-    observer = ObserverThread("viewer", FailsToFinish(), capacity=10)
+    observer = observing(FailsToFinish(), capacity=10)
     observer.close(DEADLINE_S)
     assert observer.failure == "disk full"
 
 
 def test_close_gives_up_on_a_consumer_that_hangs() -> None:
     consumer = Recorder(held=True)
-    observer = ObserverThread("viewer", consumer, capacity=10)
+    observer = observing(consumer, capacity=10)
     observer.emit(make_tick(0))
     assert consumer.busy.wait(DEADLINE_S)
     observer.emit(make_tick(1))

@@ -27,7 +27,8 @@ class RecorderStand:
         self.told: list[str] = []
         self.packets = PacketPipe(os.dup(tlog_pipe.writer.fileno()), wall_offset_ns=10**18)
         tlog_pipe.writer.close()
-        self.recorder = Recorder(
+        self.recorder = Recorder()
+        self.recorder.begin(
             folder,
             make_meta(),
             tlog_pipe=tlog_pipe,

@@ -94,13 +94,15 @@ def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
 def test_what_comes_while_the_writer_starts_is_recorded(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def start(*args: object, **kwargs: object) -> Recorder:
+    begin = Recorder.begin
+
+    def begin_late(*args: object, **kwargs: object) -> None:
         for number in range(100, 140):
             stand.episodes.emit(make_tick(number))
             stand.episodes.emit(make_frame(number))
-        return Recorder(*args, **kwargs)
+        begin(*args, **kwargs)
 
-    monkeypatch.setattr(episodes, "Recorder", start)
+    monkeypatch.setattr(Recorder, "begin", begin_late)
     stand.episodes.begin()
     stand.episodes.emit(make_tick(140))
     stand.episodes.emit(make_frame(140))
