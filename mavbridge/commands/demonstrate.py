@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
 
-import mavbridge
 from mavbridge.commands.demonstrate_pilot import Pilot, Variation, draw_variation
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
@@ -15,7 +14,7 @@ from mavbridge.config.episodes import DemonstrateConfig
 from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
-from mavbridge.core.provenance import digests
+from mavbridge.core.provenance import digests, versions
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_for_episodes, policy_files
@@ -121,7 +120,6 @@ def _meta(
     return FlightMeta(
         started_at=datetime.now(UTC).isoformat(),
         start_ns=start_ns,
-        mavbridge_version=mavbridge.__version__,
         source="dagger" if spec.config.has_student else "demonstration",
         policy=runner.name,
         engine=runner.engine,
@@ -134,6 +132,7 @@ def _meta(
         seed=spec.seed,
         conditions=variation.conditions.numbers(),
         policy_files=spec.weights,
+        versions=versions(),
         plan={
             "speed_mps": spec.config.speed,
             "solve_time_ms": spec.config.solve_time,

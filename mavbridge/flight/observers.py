@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-import mavbridge
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
@@ -141,7 +140,6 @@ class FlightObservers:
         meta = FlightMeta(
             started_at=datetime.fromtimestamp((start_ns + offset_ns) / NS_PER_S, UTC).isoformat(),
             start_ns=start_ns,
-            mavbridge_version=mavbridge.__version__,
             source="flight",
             policy=self._runner.name,
             engine=self._runner.engine,

@@ -89,7 +89,6 @@ class FlightWriter:
         """In the contract's order."""
         self.video_failure: WriterDiedError | None = None
         """Why frames of a camera are no longer recorded while the rest is."""
-        self._source_size: tuple[int, int] | None = None
         self.packets: BoundedQueue[ForwardedPacket] = BoundedQueue(PACKET_CAPACITY)
         """Packets in order of arrival; filled by another thread."""
         self._packet_serials, self._packets_dropped = SerialNumbers(), 0
@@ -143,8 +142,6 @@ class FlightWriter:
         if camera.features is not None and vision.feature is not None:
             camera.features.add(replay_files.feature_columns(vision, vision.feature, dropped))
         self._flush_if_due(vision.ready_ns)
-        if vision.camera == 0 and self._source_size is None:
-            self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
         row = FrameRow(
             frame_id=vision.frame_id,
             captured_ns=vision.captured_ns,
@@ -218,18 +215,11 @@ class FlightWriter:
             self.close()
             raise
         is_whole = self.video_failure is None
-        first = self._cameras[0]
-        height, width = first.video.size or (None, None)
-        source_height, source_width = self._source_size or (None, None)
         self.meta = replace(
             meta,
-            image_height=height,
-            image_width=width,
-            source_height=source_height,
-            source_width=source_width,
             finished=is_whole,
             ticks=self._ticks.rows,
-            frames=first.video.written if is_whole else None,
+            frames=self._cameras[0].video.written if is_whole else None,
             ticks_dropped=self._serials.dropped,
             frames_dropped=sum(each.serials.next - each.video.written for each in self._cameras),
         )

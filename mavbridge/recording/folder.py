@@ -98,7 +98,6 @@ class FlightMeta:
     """ISO 8601, UTC."""
     start_ns: int
     """Start of the flight on the clock of all stamps."""
-    mavbridge_version: str
     source: FlightSource
     policy: str | None
     engine: str | None
@@ -106,12 +105,6 @@ class FlightMeta:
     autopilot: str | None = None
     action_hz: float
     visual_hz: float
-    image_height: int | None = None
-    """Height of the recorded frames. The four sizes are written at the end."""
-    image_width: int | None = None
-    source_height: int | None = None
-    """Height of the incoming frames. An odd last row is cut off, which H.264 cannot have."""
-    source_width: int | None = None
     contract: Contract
     course_seed: int | None = None
     seed: int | None = None

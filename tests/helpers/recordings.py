@@ -64,7 +64,6 @@ def make_meta(**changes: Any) -> FlightMeta:
     meta = FlightMeta(
         started_at="2026-01-02T03:04:05+00:00",
         start_ns=START_NS,
-        mavbridge_version="0.1.0",
         source="flight",
         policy="scripted:hover",
         engine="torch",

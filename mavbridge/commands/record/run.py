@@ -11,7 +11,6 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-import mavbridge
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.camera.open import check_camera, open_camera, require_present
 from mavbridge.commands.config import RecordConfig
@@ -179,7 +178,6 @@ class _Session:
         return FlightMeta(
             started_at=datetime.fromtimestamp(wall_s, UTC).isoformat(),
             start_ns=begin_ns,
-            mavbridge_version=mavbridge.__version__,
             source="pilot",
             policy=None,
             engine=None,

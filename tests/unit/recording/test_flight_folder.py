@@ -44,10 +44,6 @@ def test_a_flight_comes_back(flight: Path) -> None:
         frames=10,
         ticks_dropped=0,
         frames_dropped=0,
-        image_height=48,
-        image_width=64,
-        source_height=48,
-        source_width=64,
     )
     assert back.meta == expected
     assert sorted(path.name for path in flight.iterdir()) == [
