@@ -173,7 +173,7 @@ def write_dataset(
     Return what was written, in a line for the user.
 
     Raises:
-        UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
+        UserError, DatasetError: damaged flights, or they do not fit in one dataset.
     """
     flown = common_contract(list(episodes))
     if flown.action != "sticks":

@@ -21,10 +21,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from mavbridge.core.records import ImageArray
-from mavbridge.recording.video_file import VideoError
 from policy.adapters.interface import state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
+from policy.data.flight_data import DatasetError
 from policy.files import library_name
 from policy.preprocess import resize
 
@@ -177,7 +177,7 @@ class DatasetWriter:
         images do, and is left out if it has fewer than ``MIN_ROWS`` rows.
 
         Raises:
-            VideoError: images of another size.
+            DatasetError: images of another size.
             OSError, FFmpegError: it cannot be written.
         """
         images = iter(images)
@@ -191,7 +191,7 @@ class DatasetWriter:
             for rgb in chain(first, images):
                 image = np.ascontiguousarray(fit_size(rgb, self._image_size))
                 if image.shape[:2] != (self._spec.height, self._spec.width):
-                    raise VideoError(
+                    raise DatasetError(
                         f"{name} has images of {image.shape[1]}x{image.shape[0]}, the "
                         f"first flight of {self._spec.width}x{self._spec.height}: export them apart"
                     )
@@ -253,9 +253,9 @@ class DatasetWriter:
         }
 
     def finish(self) -> None:
-        """Write the files about the whole dataset; raise VideoError if no episode had images."""
+        """Write the files about the whole dataset; raise DatasetError if no episode had images."""
         if self.rows == 0:
-            raise VideoError("nothing to export: not one image of these flights can be decoded")
+            raise DatasetError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)
         episodes.parent.mkdir(parents=True)
         pq.write_table(_tasks(self._spec.task), library_name(self._folder / names.TASKS))

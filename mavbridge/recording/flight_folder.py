@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mavbridge.core.records import CameraImage, ImageArray
 from mavbridge.recording import rows
 from mavbridge.recording.folder import (
@@ -20,8 +18,7 @@ from mavbridge.recording.folder import (
 )
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
 from mavbridge.recording.tables import count_lost, read_numbered, read_table, table_exists
-from mavbridge.recording.video_file import read_video
-from policy.data.flight_video import with_images
+from policy.data.flight_video import decode_images, decode_video, with_images
 from policy.files import why_unreadable
 
 
@@ -51,15 +48,12 @@ class RecordedFlight:
         return read_frames(self.frames)
 
     def images(self) -> Iterator[CameraImage]:
-        """Iterate over the images; raise VideoError if the video is damaged."""
-        return read_video(self.folder / self.video, self.numbers)
+        """Iterate over the images; raise DatasetError if the video is damaged."""
+        return decode_images(self.folder / self.video, self.numbers)
 
     def rgb_images(self) -> Iterator[ImageArray]:
-        """Iterate over the images; raise FlightError if they are depth images."""
-        for image in self.images():
-            if image.ndim == 2:
-                raise FlightError(f"{self.folder / self.video} holds depth: this takes RGB images")
-            yield np.asarray(image, np.uint8)
+        """Iterate over the images; raise DatasetError if they are depth images, or damaged."""
+        return decode_video(self.folder / self.video, self.numbers)
 
 
 def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
@@ -113,10 +107,7 @@ def _frames(
     table, numbers = read_numbered(
         folder / stem, rows.FRAMES, optional=rows.DEMONSTRATION_FRAMES, damage=damage
     )
-    try:
-        places, more = with_images(folder / video, numbers, is_whole=meta.finished)
-    except OSError as error:
-        raise FlightError(f"{folder / video} cannot be read: {error.strerror}") from error
+    places, more = with_images(folder / video, numbers, is_whole=meta.finished)
     if meta.finished and len(numbers) and not len(places):
         none = ValueError(f"it holds none of {len(numbers)} images")
         raise FlightError(why_unreadable(folder / video, none))

@@ -6,7 +6,6 @@ The muxer holds a frame back until the next one gives its duration, so a cut-off
 its last frame.
 """
 
-from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,9 +14,7 @@ import av
 from av.container import OutputContainer
 from av.error import FFmpegError
 
-from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
-from policy.data.flight_video import decode_images, video_parts
 
 CRF = "20"
 """Constant quality. 17 to 18 counts as visually lossless; 23 is x264's default."""
@@ -37,10 +34,6 @@ _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 WRITE_ERRORS = (OSError, FFmpegError)
 _BUFFER_BYTES = 1 << 20
 """Larger than a fragment, which is therefore written in one call that a kill cannot tear."""
-
-
-class VideoError(MavbridgeError):
-    """A video cannot be read."""
 
 
 class FragmentedMp4:
@@ -93,27 +86,3 @@ class FragmentedMp4:
             self._container.close()
         finally:
             self._file.close()
-
-
-def read_video(path: Path, numbers: Sequence[int] | None = None) -> Iterator[CameraImage]:
-    """Return the images of a ``FragmentedMp4`` file, complete or not, in the order of appending.
-
-    ``numbers`` selects the images to read; default: all that are decodable. Raise VideoError if one
-    of them cannot be decoded.
-    """
-    if numbers is not None and not len(numbers):
-        return
-    try:
-        parts = video_parts(path)
-    except OSError as error:
-        raise VideoError(f"{path} cannot be read: {error.strerror}") from error
-    wanted = [each.number for each in parts.fragments] if numbers is None else numbers
-    seen = 0
-    try:
-        for image in decode_images(path, parts, wanted):
-            yield image
-            seen += 1
-    except (OSError, ValueError, FFmpegError) as error:  # ValueError: the file is empty
-        raise VideoError(f"{path} cannot be decoded after {seen} images: {error}") from error
-    if seen < len(wanted):
-        raise VideoError(f"{path} ends after {seen} of {len(wanted)} images: it was damaged later")

@@ -163,10 +163,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     video = folder / f"camera{suffix}.mp4"
     if not video.is_file():
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
-    try:
-        places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)
-    except OSError as error:
-        raise DatasetError(why_unreadable(video, error)) from error
+    places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)
     if not len(places):
         raise DatasetError(why_unreadable(video, ValueError("there is no whole image in it")))
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]

@@ -6,7 +6,7 @@ then a moof and an mdat box for each frame.
 
 import io
 import mmap
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,12 +88,18 @@ def with_images(
 ) -> tuple[NDArray[np.int64], list[str]]:
     """Select the rows, given by their image numbers, that have an image in the video.
 
-    ``is_whole``: the flight ended normally, so each row had an image. Raises OSError.
+    ``is_whole``: the flight ended normally, so each row had an image.
 
     Returns:
         Indices of the rows, and sentences about the lost images.
+
+    Raises:
+        DatasetError: the video cannot be read.
     """
-    parts = video_parts(path)
+    try:
+        parts = video_parts(path)
+    except OSError as error:
+        raise DatasetError(why_unreadable(path, error)) from error
     found = [fragment.number for fragment in parts.fragments]
     places = np.flatnonzero(np.isin(numbers, found))
     damage = []
@@ -145,17 +151,10 @@ def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
             yield fragment
 
 
-def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> Iterator[CameraImage]:
-    """Yield the images of ``parts`` with these ascending numbers, as they were recorded.
-
-    RGB [H, W, 3] uint8, or depth [H, W] uint16.
-
-    Raises:
-        OSError, ValueError, av.FFmpegError: the data of an image is damaged.
-    """
-    wanted = set(numbers)
-    if not wanted:
-        return
+def _decoded(path: Path, wanted: set[int]) -> Iterator[CameraImage]:
+    """Yield the images with these numbers; raise OSError, ValueError or av.FFmpegError if the data
+    of one is damaged."""
+    parts = video_parts(path)
     if missing := wanted - {fragment.number for fragment in parts.fragments}:
         raise ValueError(f"{len(missing)} of {len(wanted)} images are missing")
     end = parts.fragments[-1].end
@@ -180,20 +179,32 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
         raise ValueError(f"{left} images are missing at its end")
 
 
-def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
-    """Yield the images with these numbers of a flight's video, [H, W, 3] RGB."""
-    count = 0
+def decode_images(path: Path, numbers: Sequence[int] | NDArray[np.int64]) -> Iterator[CameraImage]:
+    """Yield the images with these ascending numbers of a flight's video, as they were recorded.
+
+    RGB [H, W, 3] uint8, or depth [H, W] uint16.
+
+    Raises:
+        DatasetError: the data of an image is damaged.
+    """
+    wanted, count = set(map(int, numbers)), 0
     try:
-        for image in decode_images(path, video_parts(path), numbers.tolist()):
-            if image.ndim == 2:
-                raise DatasetError(f"{path} holds depth: training and export take RGB images")
-            yield np.asarray(image, np.uint8)
+        for image in _decoded(path, wanted) if wanted else ():
+            yield image
             count += 1
     except (av.FFmpegError, OSError, ValueError) as error:
         raise DatasetError(
-            f"{why_unreadable(path, error)}; {count} of its {len(numbers)} images came before the "
-            "damage: leave this flight out if there is no other copy"
+            f"{why_unreadable(path, error)}; {count} of its {len(wanted)} images came before the "
+            "damage: use another copy, or leave this flight out"
         ) from error
+
+
+def decode_video(path: Path, numbers: Sequence[int] | NDArray[np.int64]) -> Iterator[ImageArray]:
+    """Yield images as ``decode_images`` does; raise DatasetError if they are depth images."""
+    for image in decode_images(path, numbers):
+        if image.ndim == 2:
+            raise DatasetError(f"{path} holds depth: this takes RGB images")
+        yield np.asarray(image, np.uint8)
 
 
 def _pixels(image: av.VideoFrame, converter: VideoReformatter) -> CameraImage:

@@ -12,14 +12,14 @@ from unittest.mock import patch
 import numpy as np
 
 from helpers.factories import START_NS, make_vision_tick
-from mavbridge.core.records import ImageArray, Tick, VisionTick
+from mavbridge.core.records import CameraImage, ImageArray, Tick, VisionTick
 from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.video_process import FrameFiles, VideoJob
 from policy.contract import Contract
-from policy.data.flight_video import video_parts
+from policy.data.flight_video import decode_images, video_parts
 
 _BITS = 12
 _BLOCK = 16
@@ -44,6 +44,11 @@ def number_of(rgb: ImageArray) -> int:
 
 def count_frames(path: Path) -> int:
     return len(video_parts(path).fragments)
+
+
+def read_video(path: Path) -> Iterator[CameraImage]:
+    """Return all decodable images of a video."""
+    return decode_images(path, [fragment.number for fragment in video_parts(path).fragments])
 
 
 def make_frame(number: int, **changes: Any) -> VisionTick:

@@ -25,7 +25,7 @@ from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import FlightError
+from policy.data.flight_data import DatasetError
 from sitl.camera.shm import FramePublisher
 
 pytestmark = pytest.mark.system
@@ -152,7 +152,7 @@ def test_a_depth_policy_is_flown_and_recorded_and_refused_with_a_camera_of_colou
     assert len(images) == recorded.frames.num_rows > 30
     for image in images:
         assert np.array_equal(image, depth_scene(int(image[0, 20]) - 2020))
-    with pytest.raises(FlightError, match="holds depth"):
+    with pytest.raises(DatasetError, match="holds depth"):
         next(recorded.rgb_images())
     status, output = printed_by("replay", str(folder), "--policy", depth_policy)
     assert status == 0, output

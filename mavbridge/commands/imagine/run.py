@@ -138,7 +138,7 @@ def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
-    """Read the context, from ``start_s`` after the first state, or raise UserError, VideoError."""
+    """Read the context from ``start_s`` after the first state; raise UserError, DatasetError."""
     _require_same_kind(flight, config)
     captured_ns = flight.frames["captured_ns"].to_numpy()
     ticks = flight.ticks.filter(flight.ticks["state"].is_valid())

@@ -13,11 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.recordings import count_frames, make_row, number_of, picture, send_signal
+from helpers.recordings import (
+    count_frames,
+    make_row,
+    number_of,
+    picture,
+    read_video,
+    send_signal,
+)
 from mavbridge.recording import video_process, video_writer
 from mavbridge.recording.rows import FRAMES, read_frames
 from mavbridge.recording.tables import read_table
-from mavbridge.recording.video_file import read_video
 from mavbridge.recording.video_process import (
     MAX_BYTES,
     MAX_SLOTS,

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.recordings import count_frames
+from helpers.recordings import count_frames, read_video
 from helpers.rollouts import SIZE, Finished, make_plan, make_sampler, read_rows, run, segments
 from mavbridge.commands.imagine.loop import DECIDE, SIMULATE, RolloutPlan
-from mavbridge.recording.video_file import read_video
 
 THREAD = "mavbridge-rollout-decode"
 

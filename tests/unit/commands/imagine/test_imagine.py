@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.recordings import count_frames
+from helpers.recordings import count_frames, read_video
 from helpers.rollouts import TinyWorld, read_rows, write_flight
 from helpers.status import status_of, told_by
 from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import PolicyDecider, Sampler
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.video_file import read_video
 from policy.checkpoints.networks import load_world_model, save_world_model
 from policy.preprocess import resize
 

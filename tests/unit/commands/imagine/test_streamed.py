@@ -13,13 +13,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.recordings import count_frames, send_signal
+from helpers.recordings import count_frames, read_video, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
 from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video_file import read_video
 
 DEADLINE_S = 60.0
 PLAN = make_plan(iterations=1000)
