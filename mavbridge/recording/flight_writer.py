@@ -14,7 +14,6 @@ from mavbridge.recording.folder import (
     PACKETS,
     SOLVES,
     TICKS,
-    TLOG,
     FlightMeta,
     features_of,
     frames_of,
@@ -23,7 +22,7 @@ from mavbridge.recording.folder import (
 )
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
-from mavbridge.recording.tlog import TlogJob, TlogPipe
+from mavbridge.recording.tlog import TlogPipe
 from mavbridge.recording.video_process import VideoJob
 from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError, WriterError
 
@@ -103,7 +102,7 @@ class FlightWriter:
     def _start_videos(
         self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
     ) -> None:
-        tlog = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
+        tlog = None if tlog_pipe is None else tlog_pipe.reader
         for name in (None, *self.meta.contract.cameras[1:]):
             job = VideoJob(
                 video=self._folder / video_of(name),

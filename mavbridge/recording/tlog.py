@@ -31,14 +31,6 @@ class TlogPipe(NamedTuple):
         self.writer.close()
 
 
-class TlogJob(NamedTuple):
-    """A log to write."""
-
-    path: Path
-    """Must not exist yet."""
-    records: "Connection[Never, Never]"
-
-
 def open_tlog_pipe() -> TlogPipe:
     """Create the pipe; raise OSError if no descriptors are left."""
     return TlogPipe(*Pipe(duplex=False))
@@ -47,9 +39,9 @@ def open_tlog_pipe() -> TlogPipe:
 class TlogThread:
     """Thread that copies the pipe to the file until the pipe ends."""
 
-    def __init__(self, job: TlogJob) -> None:
-        """Start the thread. From here on only the thread uses the pipe."""
-        self._job = job
+    def __init__(self, path: Path, records: "Connection[Never, Never]") -> None:
+        """Start the thread, which alone uses the pipe from here on. No file may be at ``path``."""
+        self._path, self._records = path, records
         self._stop = threading.Event()
         self.failure: OSError | None = None
         """Why the log is no longer written; the pipe is then closed."""
@@ -58,7 +50,7 @@ class TlogThread:
 
     def _run(self) -> None:
         try:
-            with self._job.records, self._job.path.open("xb") as file:
+            with self._records, self._path.open("xb") as file:
                 while not self._stop.is_set() and self._copy(file):
                     self._stop.wait(PERIOD_S)
         except OSError as error:
@@ -66,9 +58,9 @@ class TlogThread:
 
     def _copy(self, file: BinaryIO) -> bool:
         """Append the pending data of the pipe; return False at its end."""
-        if not wait([self._job.records], PERIOD_S):
+        if not wait([self._records], PERIOD_S):
             return True
-        data = os.read(self._job.records.fileno(), READ_BYTES)
+        data = os.read(self._records.fileno(), READ_BYTES)
         file.write(data)
         file.flush()
         return bool(data)

@@ -19,14 +19,15 @@ from contextlib import suppress
 from enum import Enum, auto
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Never, TypeAlias
 
 import numpy as np
 
 from mavbridge.core.records import CameraImage
+from mavbridge.recording.folder import TLOG
 from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, frame_columns
 from mavbridge.recording.tables import FLUSH_NS, READ_ERRORS, TableWriter
-from mavbridge.recording.tlog import TlogJob, TlogThread
+from mavbridge.recording.tlog import TlogThread
 from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
@@ -37,34 +38,27 @@ MAX_BYTES = 32 << 20
 shared memory."""
 
 
-class RingShape(NamedTuple):
-    """Layout of the memory, for the other process. Its file descriptor follows on the pipe."""
+class Ring(NamedTuple):
+    """Message to the writer: layout of the memory. Its file descriptor follows on the pipe."""
 
     slots: int
-    height: int
-    width: int
-    is_depth: bool
-
-    @property
-    def frame(self) -> "np.dtype[np.void]":
-        """Data type and axes of a frame."""
-        kind, axes = (np.uint16, ()) if self.is_depth else (np.uint8, (3,))
-        return np.dtype((kind, (self.height, self.width, *axes)))
+    frame: "np.dtype[np.void]"
+    """Data type and axes of a frame."""
 
 
-def ring_shape(height: int, width: int, *, is_depth: bool = False) -> RingShape:
-    """Return the layout for frames of this size."""
-    slots = MAX_BYTES // RingShape(1, height, width, is_depth).frame.itemsize
-    return RingShape(max(MIN_SLOTS, min(MAX_SLOTS, slots)), height, width, is_depth)
+def ring_of(image: CameraImage) -> Ring:
+    """Return the layout for frames like this one."""
+    frame: np.dtype[np.void] = np.dtype((image.dtype, image.shape))
+    return Ring(max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame.itemsize)), frame)
 
 
-def allocate(shape: RingShape) -> int:
+def allocate(ring: Ring) -> int:
     """Return the descriptor of a file without a name; raise OSError if there is no memory left.
 
     The memory is freed with its last descriptor, even if both processes are killed. Its pages are
     allocated now: a page that is unavailable at its first write ends the process.
     """
-    size_bytes = shape.slots * shape.frame.itemsize
+    size_bytes = ring.slots * ring.frame.itemsize
     shared = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
     has_shared = shared.is_dir()
     with tempfile.TemporaryFile(dir=shared if has_shared else None) as file:
@@ -93,29 +87,13 @@ def receive_descriptor(pipe: "Connection[Any, Any]") -> int:
     return descriptors[0]
 
 
-class FrameRing:
-    """Slots of one frame each, mapped."""
-
-    def __init__(self, shape: RingShape, descriptor: int) -> None:
-        """Map the memory, and close the descriptor."""
-        self.shape = shape
-        try:
-            self._memory = mmap.mmap(descriptor, shape.slots * shape.frame.itemsize)
-        finally:
-            os.close(descriptor)
-        self._frames: CameraImage | None = np.ndarray(shape.slots, shape.frame, self._memory)
-
-    def slot(self, index: int) -> CameraImage:
-        """Return a view of one slot. Do not keep it beyond ``close``."""
-        if self._frames is None:
-            raise ValueError("the ring is closed")
-        frame: CameraImage = self._frames[index]
-        return frame
-
-    def close(self) -> None:
-        """Unmap the memory. Can be called twice."""
-        self._frames = None
-        self._memory.close()
+def map_ring(ring: Ring, descriptor: int) -> CameraImage:
+    """Return the slots as an array, which keeps the memory mapped, and close the descriptor."""
+    try:
+        memory = mmap.mmap(descriptor, ring.slots * ring.frame.itemsize)
+    finally:
+        os.close(descriptor)
+    return np.ndarray(ring.slots, ring.frame, memory)
 
 
 class VideoJob(NamedTuple):
@@ -129,8 +107,8 @@ class VideoJob(NamedTuple):
     """Path and stem of the frames table; None: only a video."""
     with_truth: bool = False
     """The table has the columns of ``FrameTruth``."""
-    tlog: TlogJob | None = None
-    """Log of the link to write beside the video."""
+    tlog: "Connection[Never, Never] | None" = None
+    """Records of the link's log, which is written beside the video."""
 
 
 class FrameFiles:
@@ -228,8 +206,8 @@ class Notice(Enum):
     """Sent by the writer: everything is closed."""
 
 
-ToWriter: TypeAlias = RingShape | Submit | Notice
-"""A ``RingShape`` comes first: it describes the memory for the frames."""
+ToWriter: TypeAlias = Ring | Submit | Notice
+"""A ``Ring`` comes before the first frame."""
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
@@ -239,7 +217,7 @@ def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     os.nice(niceness)
-    tlog = None if job.tlog is None else TlogThread(job.tlog)
+    tlog = None if job.tlog is None else TlogThread(job.video.with_name(TLOG), job.tlog)
     service = WriterService(pipe, job, tlog)
     service.send(Notice.READY)
     while service.is_open:
@@ -261,7 +239,7 @@ class WriterService:
         self._tlog = tlog
         self._files = FrameFiles(job)
         self._folder = job.video.parent
-        self._ring: FrameRing | None = None
+        self._slots: CameraImage | None = None
         self.is_open = True
         self.has_failed = False
 
@@ -282,12 +260,12 @@ class WriterService:
                 self._files.flush()
                 return
             match self._receive():
-                case Submit(slot=slot, row=row) if self._ring is not None:
-                    self._files.append(self._ring.slot(slot), row)
+                case Submit(slot=slot, row=row) if self._slots is not None:
+                    self._files.append(self._slots[slot], row)
                     self.send(Written(slot))
                 case Notice.FINISH:
                     self._files.finish()
-                    self._close()
+                    self.is_open = False
                     self.send(Notice.DONE)
         except FILE_ERRORS as error:
             self._fail("video", error)
@@ -296,8 +274,8 @@ class WriterService:
         """Return the next message, or ``FINISH`` if the producer is gone; open the ring."""
         try:
             message = self._pipe.recv()
-            if isinstance(message, RingShape):
-                self._ring = FrameRing(message, receive_descriptor(self._pipe))
+            if isinstance(message, Ring):
+                self._slots = map_ring(message, receive_descriptor(self._pipe))
         except (EOFError, ConnectionResetError):
             return Notice.FINISH
         return message
@@ -305,12 +283,6 @@ class WriterService:
     def _fail(self, what: str, error: Exception) -> None:
         self.has_failed = True
         self._files.abandon()
-        self._close()
+        self.is_open = False
         reason = getattr(error, "strerror", None) or error
         self.send(Failed(f"the {what} cannot be written: {self._folder}: {reason}"))
-
-    def _close(self) -> None:
-        self.is_open = False
-        if self._ring is not None:
-            self._ring.close()
-            self._ring = None

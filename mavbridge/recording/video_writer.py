@@ -5,7 +5,6 @@ import os
 import weakref
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -17,7 +16,6 @@ from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.video_process import (
     NICENESS,
     Failed,
-    FrameRing,
     FromWriter,
     Notice,
     Submit,
@@ -25,7 +23,8 @@ from mavbridge.recording.video_process import (
     VideoJob,
     Written,
     allocate,
-    ring_shape,
+    map_ring,
+    ring_of,
     run_writer,
     send_descriptor,
 )
@@ -63,7 +62,8 @@ class VideoWriter:
         ``pressure``: behaviour with a full ring. Online, the process yields the CPU to all others.
         """
         self._pressure: Pressure = pressure
-        self._ring: FrameRing | None = None
+        self._slots: CameraImage | None = None
+        """Memory for frames; None before the first and after ``close``."""
         self._free: deque[int] = deque()
         self._failure: WriterError | None = None
         self._pending_drops = 0
@@ -76,20 +76,13 @@ class VideoWriter:
         self._pipe, self._process = start_process(job, NICENESS if pressure == "online" else 0)
         # A policy's forks must not hide the producer's death from the writer.
         os.register_at_fork(after_in_child=self._pipe.close)
-        self._resources = ExitStack()
-        self._resources.callback(self._pipe.close)
         # A producer that ends without ``close`` must not wait for its writer.
-        weakref.finalize(self, self._resources.close)
+        weakref.finalize(self, self._pipe.close)
         try:
             self._wait_until(lambda: Notice.READY in self._notices, START_S)
         except WriterError:
             self.close()
             raise
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Height and width of the recorded frames; None before the first."""
-        return None if self._ring is None else (self._ring.shape.height, self._ring.shape.width)
 
     def submit(self, rgb: CameraImage, row: FrameRow) -> None:
         """Hand a frame over; the caller can overwrite it afterwards.
@@ -104,51 +97,51 @@ class VideoWriter:
         self._receive()
         height, width = rgb.shape[:2]
         rgb = rgb[: height // 2 * 2, : width // 2 * 2]
-        ring = self._ring or (self._open(rgb) if rgb.size else None)
-        if ring is None or rgb.shape != ring.shape.frame.shape:
+        if self._slots is None and rgb.size:
+            self._slots = self._open(rgb)
+        slots = self._slots
+        if slots is None or rgb.shape != slots.shape[1:]:
             self._see_misfit(height, width)
-            ring = None
+            slots = None
         elif self._pressure == "offline":
             self._wait_until(lambda: bool(self._free))
-        if ring is None or not self._free:
+        if slots is None or not self._free:
             self._pending_drops += 1 + row.dropped_before
             return
         slot = self._free.popleft()
-        ring.slot(slot)[:] = rgb
+        slots[slot] = rgb
         dropped, self._pending_drops = row.dropped_before + self._pending_drops, 0
         self._send(Submit(slot, replace(row, dropped_before=dropped)))
 
     def _see_misfit(self, height: int, width: int) -> None:
-        if self.size is None:
+        if self._slots is None:
             what = f"the camera's images of {width}x{height} are too small for a video"
         else:
-            before = f"{self.size[1]}x{self.size[0]}"
+            before = f"{self._slots.shape[2]}x{self._slots.shape[1]}"
             what = f"the camera's images have changed from {before} to {width}x{height}"
         if self._pressure == "offline":
             raise ValueError(what)
         self.misfit = self.misfit or what
 
-    def _open(self, rgb: CameraImage) -> FrameRing:
-        height, width = rgb.shape[:2]
-        shape = ring_shape(height, width, is_depth=rgb.ndim == 2)
+    def _open(self, rgb: CameraImage) -> CameraImage:
+        ring = ring_of(rgb)
         try:
-            descriptor = allocate(shape)
+            descriptor = allocate(ring)
         except OSError as error:
             self._failure = WriterError(
-                f"no shared memory for frames of {width}x{height}: {error.strerror}; a container "
-                "needs more of it (docker run --shm-size)"
+                f"no shared memory for frames of {rgb.shape[1]}x{rgb.shape[0]}: {error.strerror}; "
+                "a container needs more of it (docker run --shm-size)"
             )
             raise self._failure from error
         try:
-            self._send(shape)
+            self._send(ring)
             send_descriptor(self._pipe, descriptor)
         except OSError:
             raise self._died() from None
         finally:
-            ring = self._ring = FrameRing(shape, descriptor)
-            self._resources.callback(ring.close)
-        self._free.extend(range(shape.slots))
-        return ring
+            slots = map_ring(ring, descriptor)
+        self._free.extend(range(ring.slots))
+        return slots
 
     def finish(self) -> None:
         """Wait until every frame is on disk and the files are closed, and end the process."""
@@ -206,7 +199,8 @@ class VideoWriter:
 
     def close(self) -> None:
         """End the process; frames submitted but not written can be lost. Can be called twice."""
-        self._resources.close()
+        self._slots = None
+        self._pipe.close()
         self._process.join(END_S)
         is_keeping_log = self._keeps_log and Notice.DONE in self._notices
         if self._process.is_alive() and not is_keeping_log:
@@ -228,5 +222,5 @@ def start_process(
     finally:
         its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
         if job.tlog is not None:
-            job.tlog.records.close()
+            job.tlog.close()
     return pipe, process

@@ -85,17 +85,15 @@ class InProcessWriter:
 
     def __init__(self, job: VideoJob, *, pressure: str) -> None:
         if job.tlog is not None:
-            job.tlog.records.close()
+            job.tlog.close()
         self._files = FrameFiles(job)
         self._is_open = True
-        self.size: tuple[int, int] | None = None
         self.written = 0
 
-    def submit(self, rgb: ImageArray, row: FrameRow) -> bool:
-        height, width = self.size = (rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2)
+    def submit(self, rgb: ImageArray, row: FrameRow) -> None:
+        height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
         self._files.append(rgb[:height, :width], row)
         self.written += 1
-        return True
 
     def finish(self) -> None:
         self.close()

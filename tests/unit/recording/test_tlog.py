@@ -12,7 +12,7 @@ import pytest
 from helpers.recordings import count_frames, make_row, picture
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.recording.tlog import TlogJob, TlogPipe, TlogThread, open_tlog_pipe
+from mavbridge.recording.tlog import TlogPipe, TlogThread, open_tlog_pipe
 from mavbridge.recording.video_process import VideoJob
 from mavbridge.recording.video_writer import VideoWriter, WriterError
 
@@ -43,8 +43,8 @@ def link(pipe: TlogPipe) -> Iterator[PacketPipe]:
 
 @pytest.fixture
 def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWriter]:
-    job = TlogJob(tmp_path / "link.tlog", pipe.reader)
-    made = VideoWriter(VideoJob(tmp_path / "camera.mp4", 30, tlog=job), pressure="online")
+    job = VideoJob(tmp_path / "camera.mp4", 30, tlog=pipe.reader)
+    made = VideoWriter(job, pressure="online")
     yield made
     made.close()
 
@@ -66,7 +66,7 @@ def test_a_pipe_that_does_not_end_or_cannot_be_written_is_left(
     deadline_s: float,
     failure: type[Exception] | None,
 ) -> None:
-    thread = TlogThread(TlogJob(tmp_path / name, pipe.reader))
+    thread = TlogThread(tmp_path / name, pipe.reader)
     thread.finish(deadline_s)
     assert thread.failure is None if failure is None else isinstance(thread.failure, failure)
     send(link, 2)
