@@ -5,7 +5,6 @@ import io
 import os
 import select
 import sys
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import IO, TextIO, cast
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
-from rich.text import Text
 
 from mavbridge.core.provenance import printable
 
@@ -23,8 +21,6 @@ WRITE_BYTES = 512
 """Bytes handed to the kernel per write: a ready pipe takes them all (POSIX: _POSIX_PIPE_BUF)."""
 MAX_LINE = 2000
 """Kept characters of an unfinished line; longer text counts as a line."""
-MAX_MESSAGES = 100
-"""Capacity of a message queue. When it is full, the oldest messages are dropped and counted."""
 
 
 class PatientOutput(io.TextIOBase):
@@ -95,33 +91,6 @@ def patient_console(*, stderr: bool = True) -> Console:
         return SafeConsole(file=cast(TextIO, stream), emoji=False)
     except (OSError, AttributeError):  # the stream is closed, or replaced by a mere buffer
         return SafeConsole(stderr=stderr, emoji=False)
-
-
-class MessageQueue:
-    """Messages of any thread for a console; one thread prints them."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[tuple[RenderableType, bool]] = deque(maxlen=MAX_MESSAGES)
-        self._dropped = 0
-
-    def __len__(self) -> int:
-        """Return the number of waiting messages."""
-        return len(self._waiting)
-
-    def put(self, message: RenderableType, *, soft_wrap: bool = True) -> None:
-        """Add a message; with ``soft_wrap`` the terminal wraps its lines."""
-        if len(self._waiting) == MAX_MESSAGES:
-            self._dropped += 1  # two threads at once can lose one count
-        self._waiting.append((message, soft_wrap))
-
-    def print_to(self, console: Console) -> None:
-        """Print and remove all messages."""
-        dropped, self._dropped = self._dropped, 0
-        if dropped:
-            console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
-        while self._waiting:
-            message, soft_wrap = self._waiting.popleft()
-            console.print(message, soft_wrap=soft_wrap)
 
 
 class _SurvivingText(io.TextIOWrapper):

@@ -6,7 +6,7 @@ from collections import deque
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import NamedTuple
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -18,7 +18,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import HungError, Worker
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.observe.keyboard import ignore_job_control
-from mavbridge.observe.output import MessageQueue, PatientOutput, stray_lines_shown
+from mavbridge.observe.output import PatientOutput, stray_lines_shown
 from mavbridge.observe.timing import TimingReport
 
 _said = logging.getLogger(SAID)
@@ -28,6 +28,8 @@ RATE_WINDOW_S = 1.0
 ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
 """Interval between lines if the output is not a terminal."""
+MAX_MESSAGES = 100
+"""Most messages that wait to be printed; then the oldest are dropped and counted."""
 RELEASES_SHOWN = 3
 GOOD, POOR, BAD = "green", "yellow", "red"
 _LEGEND = (
@@ -72,7 +74,9 @@ class MessageScreen:
     def __init__(self, console: Console) -> None:
         """Show messages on ``console``, for a stalled reader a ``patient_console``."""
         self._console = console
-        self._messages = MessageQueue()
+        self._messages: deque[tuple[RenderableType, bool]] = deque(maxlen=MAX_MESSAGES)
+        """Messages, and whether the terminal wraps their lines."""
+        self._dropped = 0
         self._worker: Worker | None = None
         self._redirection = ExitStack()
 
@@ -107,18 +111,31 @@ class MessageScreen:
     def show_message(self, text: str, style: str = "") -> None:
         """Log a message now, and show it with the next refresh."""
         _said.info("%s", text)
-        self._messages.put(Text(without_secrets(text), style=style))
+        self._put(Text(without_secrets(text), style=style))
+
+    def _put(self, message: RenderableType, *, soft_wrap: bool = True) -> None:
+        if len(self._messages) == MAX_MESSAGES:
+            self._dropped += 1  # two threads at once can lose one count
+        self._messages.append((message, soft_wrap))
+
+    def _print_messages(self) -> None:
+        dropped, self._dropped = self._dropped, 0
+        if dropped:
+            self._console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
+        while self._messages:
+            message, soft_wrap = self._messages.popleft()
+            self._console.print(message, soft_wrap=soft_wrap)
 
     def _show_stray(self, text: str) -> None:
         """Show a line printed elsewhere in the process; lines of the log are already logged."""
         if not is_log_thread():
             _said.info("%s", text)
-        self._messages.put(Text(without_secrets(text), style="dim"))
+        self._put(Text(without_secrets(text), style="dim"))
 
     def _run(self, stop: threading.Event) -> None:
         while not stop.wait(1 / STATUS_HZ):
-            self._messages.print_to(self._console)
-        self._messages.print_to(self._console)
+            self._print_messages()
+        self._print_messages()
 
 
 class FlightScreen(MessageScreen):
@@ -183,10 +200,10 @@ class FlightScreen(MessageScreen):
     def show_report(self, report: TimingReport) -> None:
         """Show the table of measurements and the findings with the next refresh."""
         if (table := timing_table(report)) is not None:
-            self._messages.put(table, soft_wrap=False)
+            self._put(table, soft_wrap=False)
         for finding in findings(report):
             _said.info("%s", finding.line.plain)
-            self._messages.put(finding.line, soft_wrap=not self._console.is_terminal)
+            self._put(finding.line, soft_wrap=not self._console.is_terminal)
 
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
@@ -226,7 +243,7 @@ class FlightScreen(MessageScreen):
         with self.live():
             while not stop.wait(1 / STATUS_HZ):
                 self.refresh()
-        self._messages.print_to(self._console)
+        self._print_messages()
 
     def live(self) -> AbstractContextManager[object]:
         """Context manager: show the status line if there is a terminal."""
@@ -237,7 +254,7 @@ class FlightScreen(MessageScreen):
 
         During a flight only the screen's own thread calls this, at ``STATUS_HZ``.
         """
-        self._messages.print_to(self._console)
+        self._print_messages()
         line = self.status_line()
         self._refreshes += 1
         if self._console.is_terminal:

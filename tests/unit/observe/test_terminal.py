@@ -17,8 +17,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.observe.output import MAX_MESSAGES
-from mavbridge.observe.terminal import PLAIN_PERIOD_S, STATUS_HZ, FlightScreen
+from mavbridge.observe.terminal import MAX_MESSAGES, PLAIN_PERIOD_S, STATUS_HZ, FlightScreen
 
 ONE_UP_AND_ERASE = "\x1b[1A\x1b[2K"
 REFRESH_TICKS = round(100 / STATUS_HZ)
