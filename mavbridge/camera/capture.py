@@ -3,14 +3,14 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mavbridge.camera.grabber import Image
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import CameraImage
@@ -27,33 +27,6 @@ SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 """Modes of practically every camera; the smallest that covers the policy's image is used."""
-MAX_FIRST_AGE_NS = NS_PER_S
-"""Age up to which a stamp shows that its source stamps on our clock."""
-
-
-@dataclass(slots=True)
-class ExposureClock:
-    """Clock of one open source's stamps: ours from the first plausible stamp on.
-
-    Later stamps are then exposures at any age, so that an old image cannot pass for a new one.
-    """
-
-    is_ours: bool = False
-    latency_ns: int = 0
-    """Time from exposure to arrival, as given by the user."""
-
-    def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """Return the stamp if the source stamps on our clock, else the arrival less the latency.
-
-        A stamp within the latency is no exposure: drivers may stamp the start of the transfer.
-
-        Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
-        (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
-        """
-        self.is_ours = self.is_ours or 0 <= arrived_ns - stamp_ns <= MAX_FIRST_AGE_NS
-        latest_ns = arrived_ns - self.latency_ns
-        is_exposure = stamp_ns > 0 and not latest_ns < stamp_ns <= arrived_ns
-        return stamp_ns if self.is_ours and is_exposure else latest_ns
 
 
 @dataclass(slots=True)
@@ -65,27 +38,24 @@ class CaptureSource:
     failure: str
     clock: Clock
     has_driver_stamps: bool = False
-    stamps: ExposureClock = field(default_factory=ExposureClock)
+    """True on a device. Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as
+    CAP_PROP_POS_MSEC (modules/videoio/src/cap_v4l.cpp); other systems return something else."""
 
     def next_image(self) -> Image:
         """See `ImageSource`."""
         if not self.capture.grab():
             raise CameraError(f"{self.name} {self.failure}")
-        captured_ns = self.clock.now_ns()
+        arrived_ns, stamp_ms = self.clock.now_ns(), 0.0
         if self.has_driver_stamps:
-            stamp_ns = round(self.capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
-            captured_ns = self.stamps.exposure_ns(stamp_ns, captured_ns)
-        rgb = retrieve_rgb(self.capture, self.name)
-        return Image(captured_ns, rgb, is_stamped=self.stamps.is_ours)
+            stamp_ms = self.capture.get(cv2.CAP_PROP_POS_MSEC)
+        return Image(arrived_ns, retrieve_rgb(self.capture, self.name), round(stamp_ms * NS_PER_MS))
 
     def close(self) -> None:
         """See `ImageSource`."""
         self.capture.release()
 
 
-def open_device(
-    device: int | Path, *, image_size: tuple[int, int], clock: Clock, latency_ns: int = 0
-) -> CaptureSource:
+def open_device(device: int | Path, *, image_size: tuple[int, int], clock: Clock) -> CaptureSource:
     """Open a local camera: ``0`` or ``/dev/video0``. Raises CameraError.
 
     ``image_size`` is the least height and width [pixels].
@@ -98,8 +68,7 @@ def open_device(
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     capture.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
     failure = "has stopped delivering frames: was it unplugged?"
-    name, stamps = f"camera {device}", ExposureClock(latency_ns=latency_ns)
-    return CaptureSource(capture, name, failure, clock, has_driver_stamps=True, stamps=stamps)
+    return CaptureSource(capture, f"camera {device}", failure, clock, has_driver_stamps=True)
 
 
 def present_devices() -> str:

@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from mavbridge.core.clock import NS_PER_S, Clock
@@ -13,6 +14,8 @@ REOPENED_NS = 10 * NS_PER_S
 """Limit for the first frame of a reopened source: exposure control, negotiation."""
 STALL_NS = 2 * NS_PER_S
 """Limit for all other frames."""
+MAX_FIRST_AGE_NS = NS_PER_S
+"""Age up to which a stamp shows that its source stamps on our clock."""
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
 JOIN_S = 3.0
 
@@ -27,13 +30,37 @@ def wait_until_due(clock: Clock, due_ns: int, timeout_ns: int) -> bool:
 
 
 class Image(NamedTuple):
-    """Image of one frame, with its stamp."""
+    """Image of one frame, with its arrival."""
 
-    captured_ns: int
+    arrived_ns: int
     rgb: CameraImage
     """Owned by the receiver."""
-    is_stamped: bool = False
-    """True if the source tells the exposure."""
+    stamp_ns: int = 0
+    """Stamp of the source, by an unknown clock; 0 if there is none."""
+
+
+@dataclass(slots=True)
+class ExposureClock:
+    """Clock of one open source's stamps: ours from the first plausible stamp on.
+
+    Later stamps are then exposures at any age, so that an old image cannot pass for a new one.
+    """
+
+    is_ours: bool = False
+    latency_ns: int = 0
+    """Time from exposure to arrival, as given by the user."""
+
+    def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
+        """Return the stamp if the source stamps on our clock, else the arrival less the latency.
+
+        A stamp within the latency is no exposure: drivers may stamp the start of the transfer.
+        """
+        is_stamp = stamp_ns > 0
+        is_recent = 0 <= arrived_ns - stamp_ns <= MAX_FIRST_AGE_NS
+        self.is_ours = self.is_ours or (is_stamp and is_recent)
+        latest_ns = arrived_ns - self.latency_ns
+        is_exposure = is_stamp and not latest_ns < stamp_ns <= arrived_ns
+        return stamp_ns if self.is_ours and is_exposure else latest_ns
 
 
 class ImageSource(Protocol):
@@ -64,11 +91,13 @@ class Grabber:
         open_source: Callable[[], ImageSource],
         *,
         clock: Clock,
+        latency_ns: int = 0,
         reopen_delays_s: Sequence[float] = REOPEN_DELAYS_S,
     ) -> None:
-        """Start the thread, which opens the source."""
+        """Start the thread, which opens the source; ``latency_ns``: see ``ExposureClock``."""
         self._open_source = open_source
         self._clock = clock
+        self._latency_ns = latency_ns
         self._reopen_delays_s = reopen_delays_s
         self._changed = threading.Condition()
         self._stopping = threading.Event()
@@ -144,20 +173,21 @@ class Grabber:
 
     def _drain(self, source: ImageSource) -> str:
         """Receive frames until the source ends. Return the reason for the end."""
+        stamps = ExposureClock(latency_ns=self._latency_ns)
         try:
             while not self._stopping.is_set():
                 if (image := source.next_image()) is None:
                     continue
-                captured_ns, rgb, is_stamped = image
-                rgb.flags.writeable = False
+                captured_ns = stamps.exposure_ns(image.stamp_ns, image.arrived_ns)
+                image.rgb.flags.writeable = False
                 with self._changed:
                     self._frame_count += 1
                     self.dropped_frames += self._newest is not None
                     self._newest = Frame(
                         frame_id=self._frame_count,
                         captured_ns=captured_ns,
-                        rgb=rgb,
-                        is_stamped=is_stamped,
+                        rgb=image.rgb,
+                        is_stamped=stamps.is_ours,
                     )
                     self._silent_after_ns = self._clock.now_ns() + STALL_NS
                     self._changed.notify_all()

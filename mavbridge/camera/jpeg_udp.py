@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from struct import Struct
 from typing import NamedTuple
 
-from mavbridge.camera.capture import ExposureClock
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
 from mavbridge.core.address import LOOPBACK, host_port, spelled
@@ -129,12 +128,11 @@ class FrameAssembler:
 class JpegUdpSource:
     """`ImageSource` over a UDP port; returns the newest whole frame."""
 
-    def __init__(self, host: str, port: int, *, clock: Clock, latency_ns: int = 0) -> None:
+    def __init__(self, host: str, port: int, *, clock: Clock) -> None:
         """Bind the port. Raises CameraError on failure."""
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
-        self._stamps = ExposureClock(latency_ns=latency_ns)
         self._datagrams = self._bad_frames = 0
         self._silent_after_ns = clock.now_ns() + SILENT_NS
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -158,8 +156,7 @@ class JpegUdpSource:
         self._silent_after_ns = self._clock.now_ns() + SILENT_NS
         if (pixels := decode_picture(frame.picture)) is not None:
             self._bad_frames = 0
-            captured_ns = self._stamps.exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
-            return Image(captured_ns, pixels, is_stamped=self._stamps.is_ours)
+            return Image(frame.arrived_ns, pixels, frame.key.stamp_ns)
         self._bad_frames += 1
         if self._bad_frames > MAX_BAD_FRAMES:
             raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")

@@ -3,14 +3,13 @@
 import stat
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from mavbridge.camera.capture import open_device, open_stream, present_devices
-from mavbridge.camera.grabber import Grabber, Image, wait_until_due
+from mavbridge.camera.grabber import Grabber, ImageSource, wait_until_due
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.pipe import PipeSource, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
@@ -41,23 +40,24 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
 
     Raises:
         UserError: ``spec`` has no known form, names no file, needs a package that is missing,
-            or stamps its frames itself and ``latency_ms`` is not 0.
+            or delivers images without a delay and ``latency_ms`` is not 0.
     """
     kind, _, rest = spec.partition(":")
-    mode = _file_mode(spec)
-    if kind == "shm":
-        if latency_ms != 0.0:
-            raise UserError(
-                f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps "
-                "each frame with its exposure; mend the stamps there, or leave the flag out"
-            )
-    elif kind == "pipe":
+    is_file = stat.S_ISREG(mode := _file_mode(spec)) and not _is_stream(spec)
+    if latency_ms != 0.0 and (kind == "shm" or is_file or spec == NO_CAMERA):
+        raise UserError(
+            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its frames are stamped "
+            "with their exposure; mend a writer's stamps, or leave the flag out"
+        )
+    if kind == "pipe":
         parse_pipe(rest)
     elif kind == "jpeg-udp":
         parse_jpeg_udp(rest)
     elif kind == "screen":
         require_packages("--camera screen:", *SCREEN_PACKAGES)
-    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or stat.S_ISREG(mode)):
+    elif not (
+        kind == "shm" or spec == NO_CAMERA or is_file or _is_stream(spec) or _is_device(spec)
+    ):
         if stat.S_ISFIFO(mode):
             raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
@@ -119,7 +119,7 @@ def open_camera(
         clock: time of the waits, and of the stamps made here.
         timeout_s: longest wait for the first frame; meanwhile a device or stream that cannot be
             opened is retried, and shared memory may appear.
-        latency_ms: time from exposure to arrival; see `ExposureClock` for sources with stamps.
+        latency_ms: time from exposure to arrival; see `ExposureClock`.
         report: gets a line of a countdown for every second of the wait.
         is_depth: True: the policy takes depth; False: RGB; None: either.
 
@@ -130,18 +130,19 @@ def open_camera(
     check_camera(spec, latency_ms=latency_ms)
     latency_ns = round(latency_ms * NS_PER_MS)
     camera = _open(spec, image_size, clock=clock, latency_ns=latency_ns, is_depth=is_depth)
-    first: Image | Frame | None = camera.upcoming if isinstance(camera, VideoFileCamera) else None
+    first: CameraImage | None = None
     try:
+        if isinstance(camera, VideoFileCamera) and camera.upcoming is not None:
+            first = camera.upcoming.rgb
         if isinstance(camera, Grabber | SharedMemoryCamera):
-            first = _wait_for_first_frame(camera, clock=clock, timeout_s=timeout_s, report=report)
+            frame = _wait_for_first_frame(camera, clock=clock, timeout_s=timeout_s, report=report)
+            first = frame.rgb
         if spec != NO_CAMERA:
             _require_kind(spec, first, is_depth)
     except BaseException:
         camera.close()
         raise
-    if latency_ns == 0 or _is_device(spec) or spec.startswith("jpeg-udp:"):
-        return camera
-    return LatencyCompensatedCamera(camera, latency_ns=latency_ns)
+    return camera
 
 
 def _wait_for_first_frame(
@@ -174,12 +175,12 @@ def _wait_for_first_frame(
     )
 
 
-def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:
+def _require_kind(spec: str, first: CameraImage | None, is_depth: bool | None) -> None:
     """Raise UserError for depth instead of RGB, or the reverse; without ``first``, assume RGB."""
-    shape = (0, 0, 3) if first is None else first.rgb.shape
+    shape = (0, 0, 3) if first is None else first.shape
     if is_depth is None or is_depth == (len(shape) == 2):
         return
-    size = f" of {shape[1]}x{shape[0]}" if first else ""
+    size = "" if first is None else f" of {shape[1]}x{shape[0]}"
     found, wanted = (f"RGB images{size}", "depth") if is_depth else (f"depth{size}", "RGB images")
     advice = (
         "16-bit depth, such as pipe:640x480:gray16le:COMMAND" if is_depth else "a colour camera"
@@ -201,20 +202,20 @@ def _open(
     if kind == "screen":
         from mavbridge.camera.screen import ScreenCamera
 
-        return ScreenCamera(rest, clock=clock)
+        return ScreenCamera(rest, clock=clock, latency_ns=latency_ns)
+    opener: Callable[[], ImageSource]
     if kind == "pipe":
-        return Grabber(partial(PipeSource, parse_pipe(rest), clock=clock), clock=clock)
-    if kind == "jpeg-udp":
-        host, port = parse_jpeg_udp(rest)
-        receiver = partial(JpegUdpSource, host, port, clock=clock, latency_ns=latency_ns)
-        return Grabber(receiver, clock=clock)
-    if _is_stream(spec):
-        return Grabber(partial(open_stream, spec, clock=clock), clock=clock)
-    if _is_device(spec):
+        opener = partial(PipeSource, parse_pipe(rest), clock=clock)
+    elif kind == "jpeg-udp":
+        opener = partial(JpegUdpSource, *parse_jpeg_udp(rest), clock=clock)
+    elif _is_stream(spec):
+        opener = partial(open_stream, spec, clock=clock)
+    elif _is_device(spec):
         device = int(spec) if spec.isdecimal() else Path(spec)
-        opener = partial(open_device, image_size=size, clock=clock, latency_ns=latency_ns)
-        return Grabber(partial(opener, device), clock=clock)
-    return VideoFileCamera(Path(spec), clock=clock)
+        opener = partial(open_device, device, image_size=size, clock=clock)
+    else:
+        return VideoFileCamera(Path(spec), clock=clock)
+    return Grabber(opener, clock=clock, latency_ns=latency_ns)
 
 
 class BlankCamera:
@@ -244,28 +245,3 @@ class BlankCamera:
 
     def close(self) -> None:
         """No-op."""
-
-
-class LatencyCompensatedCamera:
-    """Wrapper that moves arrival stamps back by the camera's latency from exposure to arrival."""
-
-    def __init__(self, camera: Camera, *, latency_ns: int) -> None:
-        """Wrap an open camera; closing the wrapper closes it."""
-        self._camera = camera
-        self._latency_ns = latency_ns
-
-    @property
-    def dropped_frames(self) -> int:
-        """See `mavbridge.core.records.Camera`."""
-        return self._camera.dropped_frames
-
-    def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.records.Camera`."""
-        frame = self._camera.read(timeout_ns)
-        if frame is None:
-            return None
-        return replace(frame, captured_ns=frame.captured_ns - self._latency_ns)
-
-    def close(self) -> None:
-        """Close the wrapped camera."""
-        self._camera.close()

@@ -140,7 +140,7 @@ class PipeSource:
         frame, first_ns = newest
         if (rgb := self._cutter.decode(frame)) is not None:
             self._bad_frames = 0
-            return Image(captured_ns=first_ns, rgb=rgb)
+            return Image(first_ns, rgb)
         self._bad_frames += 1
         if self._bad_frames > MAX_BAD_FRAMES:
             raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")

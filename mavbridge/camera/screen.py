@@ -96,8 +96,10 @@ class ScreenCamera:
 
     dropped_frames = 0
 
-    def __init__(self, title: str, *, clock: Clock) -> None:
+    def __init__(self, title: str, *, clock: Clock, latency_ns: int = 0) -> None:
         """Find the window; an empty title selects the whole screen.
+
+        ``latency_ns``: time from the exposure of a picture until it is shown.
 
         Raises:
             UserError: no window has this title, or several do.
@@ -105,6 +107,7 @@ class ScreenCamera:
         """
         self._clock = clock
         self._title = title
+        self._latency_ns = latency_ns
         self._windows: X11Screen | None = None
         try:
             self._screen = mss.MSS()
@@ -140,7 +143,8 @@ class ScreenCamera:
         rgb.flags.writeable = False
         self._frame_count += 1
         self._due_ns = captured_ns + INTERVAL_NS
-        return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=rgb)
+        exposed_ns = captured_ns - self._latency_ns
+        return Frame(frame_id=self._frame_count, captured_ns=exposed_ns, rgb=rgb)
 
     def close(self) -> None:
         """Disconnect from the display."""

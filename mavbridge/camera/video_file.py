@@ -2,20 +2,28 @@
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
 from mavbridge.camera.capture import retrieve_rgb
-from mavbridge.camera.grabber import Image, wait_until_due
+from mavbridge.camera.grabber import wait_until_due
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
-from mavbridge.core.records import Frame
+from mavbridge.core.records import CameraImage, Frame
 from policy.files import library_name
 
 DEFAULT_FPS = 30.0
 """Frame rate for files with neither stamps nor a rate."""
 DEPTH_FORMAT = int.from_bytes(b"Y1\0\x10", "little")
 """FFmpeg's gray16le, as in the camera.mp4 of a flight with depth images."""
+
+
+class FileImage(NamedTuple):
+    """Image of a file, with its time there."""
+
+    at_ns: int
+    rgb: CameraImage
 
 
 class VideoFileCamera:
@@ -40,7 +48,7 @@ class VideoFileCamera:
         self._frame_count = 0
         self.dropped_frames = 0
         self.upcoming = self._decode(previous_ns=None)
-        """Next image, stamped with its time in the file; None at the end."""
+        """Next image; None at the end."""
         if self.upcoming is None:
             self._capture.release()
             raise CameraError(f"{path} contains no video that can be decoded")
@@ -51,24 +59,24 @@ class VideoFileCamera:
             self._start_ns = self._clock.now_ns()
         if self.upcoming is None:
             raise CameraError(f"{self._path}: video ended after {self._frame_count} frames")
-        if not wait_until_due(self._clock, self._start_ns + self.upcoming.captured_ns, timeout_ns):
+        if not wait_until_due(self._clock, self._start_ns + self.upcoming.at_ns, timeout_ns):
             return None
         newest, played_ns = self.upcoming, self._clock.now_ns() - self._start_ns
         frames_before = self._frame_count
-        while self.upcoming is not None and self.upcoming.captured_ns <= played_ns:
+        while self.upcoming is not None and self.upcoming.at_ns <= played_ns:
             newest = self.upcoming
             self._frame_count += 1
-            self.upcoming = self._decode(previous_ns=newest.captured_ns)
+            self.upcoming = self._decode(previous_ns=newest.at_ns)
         self.dropped_frames += self._frame_count - frames_before - 1
-        captured_ns = self._start_ns + newest.captured_ns
+        captured_ns = self._start_ns + newest.at_ns
         return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=newest.rgb)
 
     def close(self) -> None:
         """Close the file."""
         self._capture.release()
 
-    def _decode(self, *, previous_ns: int | None) -> Image | None:
-        """Return the next image, stamped with its time in the file; None at the end.
+    def _decode(self, *, previous_ns: int | None) -> FileImage | None:
+        """Return the next image; None at the end.
 
         A stamp that does not increase, as in files without stamps, is replaced by the nominal one.
         """
@@ -79,4 +87,4 @@ class VideoFileCamera:
         rgb.flags.writeable = False
         if previous_ns is not None and stamp_ns <= previous_ns:
             stamp_ns = previous_ns + self._interval_ns
-        return Image(stamp_ns, rgb)
+        return FileImage(stamp_ns, rgb)

@@ -8,7 +8,8 @@ import pytest
 from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS
 from mavbridge.camera import capture
-from mavbridge.camera.capture import ExposureClock, device_mode, open_device, open_stream
+from mavbridge.camera.capture import device_mode, open_device, open_stream
+from mavbridge.camera.grabber import ExposureClock
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
@@ -53,7 +54,7 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
     assert opened_with == [("/dev/video7", cv2.CAP_V4L2)]
     assert device.settings == {cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}
     image = source.next_image()
-    assert (image.captured_ns, image.is_stamped) == (START_NS - 7 * NS_PER_MS, True)
+    assert (image.arrived_ns, image.stamp_ns) == (START_NS, START_NS - 7 * NS_PER_MS)
     assert image.rgb.tolist() == [[[3, 2, 1]]]
     with pytest.raises(CameraError, match="unplugged"):
         source.next_image()
@@ -91,7 +92,7 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     assert seen == [set_by_user or capture.LOW_LATENCY_OPTIONS, "-8"]
     assert dict(os.environ) == before
     image = source.next_image()
-    assert (image.captured_ns, image.is_stamped) == (START_NS, False)
+    assert (image.arrived_ns, image.stamp_ns) == (START_NS, 0)
     with pytest.raises(CameraError, match="ended, or was silent"):
         source.next_image()
 

@@ -38,7 +38,7 @@ class ScriptedSource:
         item = self.script.get(timeout=10)
         if isinstance(item, Exception):
             raise item
-        return Image(captured_ns=item, rgb=np.full((2, 2, 3), item % 256, np.uint8))
+        return Image(arrived_ns=item, rgb=np.full((2, 2, 3), item % 256, np.uint8))
 
     def close(self):
         self.is_closed = True

@@ -11,7 +11,7 @@ from helpers.camera_senders import SIDE, depth_scene, scene
 from helpers.fakes import START_NS
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, MavbridgeError, UserError
 from mavbridge.recording.video_file import FragmentedMp4
 from sitl.camera.shm import FramePublisher
@@ -32,8 +32,8 @@ def test_live_sources(source, monkeypatch):
     asked = []
 
     def opener(name):
-        def refuse(source, *, clock, image_size=None, latency_ns=None):
-            asked.append((name, source, image_size, latency_ns))
+        def refuse(source, *, clock, image_size=None):
+            asked.append((name, source, image_size))
             raise CameraError("refused")
 
         return refuse
@@ -41,12 +41,10 @@ def test_live_sources(source, monkeypatch):
     for name in ("open_device", "open_stream"):
         monkeypatch.setattr(camera_open, name, opener(name))
     with pytest.raises(CameraError, match="refused"):
-        open_camera(
-            str(source), image_size=(96, 224), clock=MonotonicClock(), timeout_s=0.1, latency_ms=3
-        )
-    expected = ("open_device", source, (96, 224), 3 * NS_PER_MS)
+        open_camera(str(source), image_size=(96, 224), clock=MonotonicClock(), timeout_s=0.1)
+    expected = ("open_device", source, (96, 224))
     if "://" in str(source):
-        expected = ("open_stream", source, None, None)
+        expected = ("open_stream", source, None)
     assert asked[0] == expected
 
 
@@ -62,14 +60,18 @@ def test_a_device_is_known_by_its_kind_and_a_named_pipe_is_told_of_another_way(t
 
 
 @pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
-def test_the_latency_lies_between_exposure_and_arrival(name, tmp_path, monkeypatch, clock):
+def test_a_file_plays_from_the_first_read_on_and_refuses_a_latency(
+    name, tmp_path, monkeypatch, clock
+):
     monkeypatch.chdir(tmp_path)
     writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()
-    camera = open_camera(name, image_size=(224, 224), clock=clock, latency_ms=120.5)
+    with pytest.raises(UserError, match=r"--camera-latency 120\.5 cannot be used with"):
+        check_camera(name, latency_ms=120.5)
+    camera = open_camera(name, image_size=(224, 224), clock=clock)
     frame = camera.read(0)
-    assert frame.captured_ns == START_NS - round(120.5 * NS_PER_MS)
+    assert frame.captured_ns == START_NS
     assert frame.rgb.shape == (32, 32, 3)
     assert camera.dropped_frames == 0
     with pytest.raises(CameraError, match="video ended after 1 frames"):
