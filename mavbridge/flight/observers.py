@@ -113,8 +113,8 @@ class FlightObservers:
             chunk_hz=self._plan.loops.action_hz,
             stick_hz=config.rates.stick_rate,
             contract=contract,
-            max_state_age_s=freshness.state_ns / NS_PER_S,
-            max_feature_age_s=freshness.feature_ns / NS_PER_S,
+            max_state_age_ns=freshness.state_ns,
+            max_feature_age_ns=freshness.feature_ns,
             to_ned=action_frame(contract).to_guard,
             gates=self._gates or (),
         )

@@ -51,9 +51,9 @@ class ViewedFlight:
     stick_hz: float
     contract: Contract = field(default_factory=Contract)
     """Kind of the actions, frame of the states, names of the cameras."""
-    max_state_age_s: float | None = None
+    max_state_age_ns: int | None = None
     """Age limits when a stick is sent; None: nothing is flown by them."""
-    max_feature_age_s: float | None = None
+    max_feature_age_ns: int | None = None
     to_ned: Callable[[FloatArray], tuple[Action, ...]] | None = None
     """Converts actions [horizon, 4] of a solve to NED and FRD; None: no plan is shown."""
     gates: tuple[CourseGate, ...] = ()

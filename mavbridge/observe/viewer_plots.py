@@ -105,8 +105,8 @@ class TimingPlots:
         slot_ns, chunk_ns = NS_PER_S / flight.stick_hz, NS_PER_S / flight.chunk_hz
         self._slot_ns, self._vision_ns = slot_ns, NS_PER_S / flight.vision_hz
         bounds_ns = {
-            layout.IMAGE_AGE: _ns(flight.max_feature_age_s),
-            layout.ATTITUDE_AGE: _ns(flight.max_state_age_s),
+            layout.IMAGE_AGE: flight.max_feature_age_ns,
+            layout.ATTITUDE_AGE: flight.max_state_age_ns,
             layout.LATENESS: slot_ns,
             layout.CHUNK_PERIOD: chunk_ns,
             layout.PREDICT: chunk_ns,
@@ -206,7 +206,3 @@ class ActionPlots:
     def _stages(self, tick: Tick) -> tuple[Action, ...]:
         echo: Action = (tick.rc_sticks if self._is_sticks else None) or _GAP
         return echo, _GAP if tick.trace is None else tick.trace.raw, tick.sent or _GAP
-
-
-def _ns(limit_s: float | None) -> float | None:
-    return None if limit_s is None else limit_s * NS_PER_S

@@ -21,7 +21,6 @@ from mavbridge.commands.inspect.analysis import (
 )
 from mavbridge.commands.inspect.page import write_page
 from mavbridge.commands.output import print_status, table_console, write_json
-from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import Observed, Tick, VisionTick
@@ -235,8 +234,8 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             chunk_hz=meta.action_hz,
             stick_hz=flight.stick_hz,
             contract=contract,
-            max_state_age_s=limits.state_ns / NS_PER_S,
-            max_feature_age_s=limits.feature_ns / NS_PER_S,
+            max_state_age_ns=limits.state_ns,
+            max_feature_age_ns=limits.feature_ns,
             to_ned=action_frame(contract).to_guard,
             gates=flight.gates,
         ),

@@ -80,8 +80,8 @@ def viewed(contract: Contract | None = None, gates: tuple[CourseGate, ...] = ())
         chunk_hz=100.0,
         stick_hz=100.0,
         contract=contract,
-        max_state_age_s=0.1,
-        max_feature_age_s=0.3,
+        max_state_age_ns=100_000_000,
+        max_feature_age_ns=300_000_000,
         to_ned=action_frame(contract).to_guard,
         gates=gates,
     )
