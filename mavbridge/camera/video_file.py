@@ -68,8 +68,10 @@ class VideoFileCamera:
             self._frame_count += 1
             self.upcoming = self._decode(previous_ns=newest.at_ns)
         self.dropped_frames += self._frame_count - frames_before - 1
-        captured_ns = self._start_ns + newest.at_ns
-        return Frame(frame_id=self._frame_count, captured_ns=captured_ns, rgb=newest.rgb)
+        due_ns = self._start_ns + newest.at_ns
+        return Frame(
+            frame_id=self._frame_count, captured_ns=due_ns, rgb=newest.rgb, is_stamped=True
+        )
 
     def close(self) -> None:
         """Close the file."""

@@ -71,7 +71,7 @@ def test_a_file_plays_from_the_first_read_on_and_refuses_a_latency(
         check_camera(name, latency_ms=120.5)
     camera = open_camera(name, image_size=(224, 224), clock=clock)
     frame = camera.read(0)
-    assert frame.captured_ns == START_NS
+    assert (frame.captured_ns, frame.is_stamped) == (START_NS, True)
     assert frame.rgb.shape == (32, 32, 3)
     assert camera.dropped_frames == 0
     with pytest.raises(CameraError, match="video ended after 1 frames"):
