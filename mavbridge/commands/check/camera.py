@@ -1,10 +1,8 @@
-"""Rows about the cameras, all of which are read at the same time for two seconds."""
+"""Rows about the cameras: all are open at the same time, and each is read for two seconds."""
 
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from statistics import median
 
@@ -15,12 +13,10 @@ from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
 from mavbridge.core.records import Camera, CameraImage
-from mavbridge.core.stopping import HungError, Worker
 from mavbridge.flight.policies import NO_IMAGE_ADVICE
 
 MEASURE_S = 2.0
 _READ_NS = NS_PER_S // 2
-_JOIN_S = 5.0
 _ENOUGH = 0.9
 """Least acceptable share of the wanted rate."""
 
@@ -69,55 +65,39 @@ class CameraView:
 
 
 def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[CheckRow]:
-    """Open, read and close every camera; a failure becomes a row."""
+    """Open all cameras, read one after the other, and close them; a failure becomes a row."""
     rows: list[CheckRow] = []
     with ExitStack() as stack:
-        watched: list[tuple[CameraNeeds, CameraView, Worker]] = []
+        opened: list[tuple[CameraNeeds, Camera]] = []
         for need in needs:
             try:
-                camera = _open(need, config, clock)
+                require_present(need.source)
+                camera = open_camera(
+                    need.source,
+                    image_size=need.size_px,
+                    clock=clock,
+                    timeout_s=config.camera_timeout,
+                    latency_ms=config.camera_latency,
+                    is_depth=need.is_depth,
+                )
             except MavbridgeError as error:
                 hint = "" if need.is_flown_by else f"; the policy {NO_IMAGE_ADVICE}"
                 rows.append(_row(need, "not opened", no_go=f"{error}{hint}"))
                 continue
             stack.callback(camera.close)
-            view = CameraView()
-            name = f"mavbridge-check-camera-{len(watched)}"
-            watched.append((need, view, Worker(name, partial(_watch, camera, view, clock))))
-        for _, _, worker in watched:
-            worker.start()
-        try:
-            for _, _, worker in watched:
-                worker.ends_within(MEASURE_S + _JOIN_S)
-        finally:  # also at Ctrl-C: no camera is closed while it is read
-            for _, view, worker in watched:
-                try:
-                    worker.join(_JOIN_S)
-                except HungError as error:
-                    view.failure = f"the camera hangs: {error}"
-        for need, view, _ in watched:
-            rows += judge(need, view, latency_ms=config.camera_latency)
+            opened.append((need, camera))
+        for need, camera in opened:
+            rows += judge(need, _watch(camera, clock), latency_ms=config.camera_latency)
     return rows
 
 
-def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
-    require_present(need.source)
-    return open_camera(
-        need.source,
-        image_size=need.size_px,
-        clock=clock,
-        timeout_s=config.camera_timeout,
-        latency_ms=config.camera_latency,
-        is_depth=need.is_depth,
-    )
-
-
-def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event) -> None:
+def _watch(camera: Camera, clock: Clock) -> CameraView:
+    seen = CameraView()
     heard_ns = clock.now_ns()
     until_ns = heard_ns + round(MEASURE_S * NS_PER_S)
     dropped_before = camera.dropped_frames
     try:
-        while clock.now_ns() < until_ns and not stop.is_set():
+        while clock.now_ns() < until_ns:
             frame = camera.read(_READ_NS)
             if frame is None:
                 continue
@@ -131,6 +111,7 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
         seen.failure = str(error)
     seen.dropped = camera.dropped_frames - dropped_before
     seen.silent_ns = clock.now_ns() - heard_ns
+    return seen
 
 
 def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[CheckRow]:

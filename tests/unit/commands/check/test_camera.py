@@ -1,6 +1,5 @@
 """Rows of cameras: rates, sizes, ages and stamps, by what the frames say."""
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.records import Frame
-from mavbridge.core.stopping import Worker
 
 FRAME_NS = 33_333_333
 SCENE = np.random.default_rng(0).integers(0, 255, (224, 224, 3)).astype(np.uint8)
@@ -93,32 +91,6 @@ def test_frames_that_nobody_read_before_the_first_one_do_not_count(
 
     monkeypatch.setattr(check_camera, "open_camera", lambda *_, **__: Camera())
     assert camera_rows([needs()], CameraConfig(), clock)[0].found == "15.0 Hz"
-
-
-def test_an_interrupted_check_closes_no_camera_that_is_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    reading, ends = threading.Event(), list[bool]()
-
-    class Camera:
-        dropped_frames = 0
-
-        def read(self, _timeout_ns: int) -> None:
-            reading.set()
-            threading.Event().wait(0.02)
-
-        def close(self) -> None:
-            ends.append(any("check-camera" in each.name for each in threading.enumerate()))
-
-    def interrupt(_worker: Worker, _timeout_s: float) -> None:
-        reading.wait(5.0)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(check_camera, "open_camera", lambda *_, **__: Camera())
-    monkeypatch.setattr(Worker, "ends_within", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        camera_rows([needs()], CameraConfig(), MonotonicClock())
-    assert ends == [False]
 
 
 def test_a_camera_that_is_not_there_is_one_row(tmp_path: Path) -> None:
