@@ -63,48 +63,40 @@ _link_row = partial(CheckRow, "link")
 _row = partial(CheckRow, "vehicle")
 
 
-class VehicleProbe:
-    """Runs a ``MavlinkLink`` without a guard. Call its methods in the order of their definition."""
+def _measured(
+    link: MavlinkLink, clock: Clock, texts: list[str]
+) -> tuple[VehicleSession, LinkStats, Reason | None]:
+    """Run a link without a guard: find the vehicle, set it up as far as it gets in time, measure.
 
-    def __init__(self, link: MavlinkLink, clock: Clock) -> None:
-        self._link = link
-        self._clock = clock
-        self.texts: list[str] = []
-        """Texts of the vehicle and the link."""
+    Return the vehicle, the figures of the link, and why the vehicle cannot be flown, or None. Its
+    texts, and those of the link, are appended to ``texts``. Raises the link's PeerError if there is
+    no vehicle in time.
+    """
 
-    def find(self) -> VehicleSession:
-        """Wait for the vehicle; raise the link's PeerError if there is none in time."""
-        while (vehicle := self._link.vehicle) is None:
-            self._pass()
-        return vehicle
+    def step() -> None:
+        link.receive()
+        texts.extend([text for text in link.snapshot().texts if text not in texts])
+        link.service()
+        clock.sleep_until_ns(clock.now_ns() + _POLL_NS)
 
-    def set_up(self) -> None:
-        """Read parameters and request streams, as far as they get in time."""
-        self._until(SET_UP_S, lambda: self.find().unfinished(self._clock.now_ns()) is None)
+    def run(limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:
+        deadline_ns = clock.now_ns() + round(limit_s * NS_PER_S)
+        while clock.now_ns() < deadline_ns and not is_over():
+            step()
 
-    def measure(self) -> LinkStats:
-        """Count messages, losses and round trips."""
-        self._until(SETTLE_S)
-        self._link.restart_counters()
-        self._until(MEASURE_S)
-        return self._link.stats()
+    def vehicle() -> VehicleSession:
+        while (found := link.vehicle) is None:
+            step()
+        return found
 
-    def problem(self) -> Reason | None:
-        """Wait for one more heartbeat; return why the vehicle cannot be flown, or None."""
-        begun_ns = self._clock.now_ns()
-        self._until(LOST_S, lambda: (self.find().condition.heartbeat or (0,))[0] > begun_ns)
-        return self.find().problem(self._clock.now_ns())
-
-    def _until(self, limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:
-        deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
-        while self._clock.now_ns() < deadline_ns and not is_over():
-            self._pass()
-
-    def _pass(self) -> None:
-        self._link.receive()
-        self.texts += [text for text in self._link.snapshot().texts if text not in self.texts]
-        self._link.service()
-        self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
+    vehicle()  # the wait for it is not part of the time to set it up
+    run(SET_UP_S, lambda: vehicle().unfinished(clock.now_ns()) is None)
+    run(SETTLE_S)
+    link.restart_counters()
+    run(MEASURE_S)
+    stats, begun_ns = link.stats(), clock.now_ns()
+    run(LOST_S, lambda: (vehicle().condition.heartbeat or (0,))[0] > begun_ns)
+    return vehicle(), stats, vehicle().problem(clock.now_ns())
 
 
 def check_vehicle(
@@ -133,11 +125,9 @@ def check_vehicle(
             # Without a policy, sticks are sent unchanged.
             meaning = ActionMeaning() if plan is None else plan.guard.meaning
             link.begin_flight(meaning, None if config.link.output == "auto" else config.link.output)
-            probe = VehicleProbe(link, clock)
-            probe.find()
-            probe.set_up()
-            stats, problem = probe.measure(), probe.problem()
-            vehicle, status = probe.find(), link.snapshot().status
+            texts: list[str] = []
+            vehicle, stats, problem = _measured(link, clock, texts)
+            status = link.snapshot().status
             terms = Terms(
                 config=config,
                 plan=plan,
@@ -147,7 +137,7 @@ def check_vehicle(
             streams = vehicle.profile.streams(state_hz=settings.state_hz)
             rows += _link_rows(stats, streams, terms, problem)
             rows += _vehicle_rows(vehicle, status, terms)
-            rows += _text_rows(probe.texts)
+            rows += _text_rows(texts)
             rows += [] if terms.is_deaf else param_rows(terms)
     except MavbridgeError as error:
         rows.append(_link_row("vehicle", "none that can be flown", _FLOWN, no_go=str(error)))
