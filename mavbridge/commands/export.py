@@ -18,14 +18,13 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export_dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
+from mavbridge.commands.export_dataset import MIN_ROWS, DatasetWriter
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
-from policy.adapters.interface import BODY_STATE_NAMES
-from policy.contract import ACTION_DIM, STATE_NAMES, STICK_TERMS
+from policy.contract import ACTION_DIM, STICK_TERMS
 from policy.data import lerobot_format as names
 from policy.data.flight_data import (
     DatasetError,
@@ -186,19 +185,7 @@ def write_dataset(
             "its exposure: are camera and telemetry of one clock?"
         )
     fps = common_fps(every)
-    first = next(chain.from_iterable(part.episode.decode() for part in every), None)
-    if first is None:
-        raise UserError("nothing to export: not one image of these flights can be decoded")
-    height, width = fit_size(first, config.image_size).shape[:2]
-    spec = DatasetSpec(
-        fps=fps,
-        height=height,
-        width=width,
-        state_frame=flown.state_frame,
-        task=config.task,
-        state_names=BODY_STATE_NAMES if config.state == "body" else STATE_NAMES,
-    )
-    writer = DatasetWriter(folder, spec, config.image_size)
+    writer = DatasetWriter(folder, config, fps=fps, state_frame=flown.state_frame)
     for episode, of_flight in zip(episodes, parts, strict=True):
         images, at = _decoded(episode, on_frame), 0
         for part in of_flight:  # the video is decoded once, from its beginning

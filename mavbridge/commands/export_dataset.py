@@ -6,9 +6,8 @@ video has one frame every 1/fps exactly, starting at 0.
 """
 
 import json
-from collections.abc import Iterable
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
@@ -20,8 +19,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from mavbridge.commands.config import ExportConfig
 from mavbridge.core.records import ImageArray
-from policy.adapters.interface import state_values
+from policy.adapters.interface import BODY_STATE_NAMES, state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
 from policy.data.flight_data import DatasetError
@@ -95,47 +95,28 @@ _OPTIONS: dict[str, object] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetSpec:
-    """Properties shared by all episodes."""
+@contextmanager
+def episode_video(
+    path: Path, fps: int, size: tuple[int, int]
+) -> Iterator[Callable[[ImageArray, int], None]]:
+    """Context manager: write frames of this height and width, each with its number from 0 on, to a
+    video, H.264, yuv420p.
 
-    fps: int
-    height: int
-    """Image height, even like ``width``."""
-    width: int
-    state_frame: StateFrame
-    task: str
-    state_names: tuple[str, ...] = STATE_NAMES
-    """Names of the numbers in ``observation.state``: by the contract or ``adapters.interface``."""
-
-
-class EpisodeVideo:
-    """Video of one episode, H.264, yuv420p, starting at time 0.
-
-    Methods raise OSError or FFmpegError if it cannot be written.
+    Raises OSError or FFmpegError if it cannot be written.
     """
+    with av.open(library_name(path), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", fps)
+        stream.height, stream.width = size
+        stream.pix_fmt, stream.options = "yuv420p", dict(_OPTIONS)
+        stream.codec_context.time_base = Fraction(1, fps)
 
-    def __init__(self, path: Path, spec: DatasetSpec) -> None:
-        self._container = av.open(library_name(path), "w", options={"movflags": "faststart"})
-        self._stream = self._container.add_stream("libx264", spec.fps)
-        self._stream.height, self._stream.width = spec.height, spec.width
-        self._stream.pix_fmt, self._stream.options = "yuv420p", dict(_OPTIONS)
-        self._time_base = self._stream.codec_context.time_base = Fraction(1, spec.fps)
-        self._frames = 0
+        def append(rgb: ImageArray, number: int) -> None:
+            frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, fps)
+            container.mux(stream.encode(frame))
 
-    def append(self, rgb: ImageArray) -> None:
-        """Encode a frame [H, W, 3] uint8."""
-        frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
-        frame.pts, frame.time_base = self._frames, self._time_base
-        self._container.mux(self._stream.encode(frame))
-        self._frames += 1
-
-    def close(self) -> None:
-        """Finish the file."""
-        try:
-            self._container.mux(self._stream.encode(None))
-        finally:
-            self._container.close()
+        yield append
+        container.mux(stream.encode(None))
 
 
 def episode_file(folder: Path, pattern: str, number: int) -> Path:
@@ -152,12 +133,15 @@ class DatasetWriter:
     Each episode has its own video and table.
     """
 
-    def __init__(self, folder: Path, spec: DatasetSpec, image_size: int | None = None) -> None:
-        """Prepare; nothing is written yet. The folder must exist and be empty.
-
-        ``image_size``: as in ``fit_size``.
-        """
-        self._folder, self._spec, self._image_size = folder, spec, image_size
+    def __init__(
+        self, folder: Path, config: ExportConfig, *, fps: int, state_frame: StateFrame
+    ) -> None:
+        """Prepare; nothing is written yet. The folder must exist and be empty."""
+        self._folder, self._config = folder, config
+        self._fps, self._state_frame = fps, state_frame
+        self._state_names = BODY_STATE_NAMES if config.state == "body" else STATE_NAMES
+        self._size: tuple[int, int] | None = None
+        """Height and width of all images, even numbers; None before the first."""
         self._tables: list[Path] = []
         self._episodes: list[dict[str, Json]] = []
         self._colours = np.zeros((3, _LEVELS), np.int64)
@@ -180,22 +164,23 @@ class DatasetWriter:
             DatasetError: images of another size.
             OSError, FFmpegError: it cannot be written.
         """
-        images = iter(images)
-        first = list(islice(images, MIN_ROWS))
+        size = self._config.image_size
+        scaled = (np.ascontiguousarray(fit_size(rgb, size)) for rgb in images)
+        first = list(islice(scaled, MIN_ROWS))
         if len(first) < MIN_ROWS:
             return 0
+        self._size = self._size or (first[0].shape[0], first[0].shape[1])
         colours = np.zeros_like(self._colours)
         count = 0
         path = episode_file(self._folder, names.VIDEO, self.episodes)
-        with closing(EpisodeVideo(path, self._spec)) as video:
-            for rgb in chain(first, images):
-                image = np.ascontiguousarray(fit_size(rgb, self._image_size))
-                if image.shape[:2] != (self._spec.height, self._spec.width):
+        with episode_video(path, self._fps, self._size) as append:
+            for image in chain(first, scaled):
+                if image.shape[:2] != self._size:
                     raise DatasetError(
                         f"{name} has images of {image.shape[1]}x{image.shape[0]}, the "
-                        f"first flight of {self._spec.width}x{self._spec.height}: export them apart"
+                        f"first flight of {self._size[1]}x{self._size[0]}: export them apart"
                     )
-                video.append(image)
+                append(image, count)
                 colours += colour_counts(image)
                 count += 1
         rows = self._rows({key: values[:count] for key, values in columns.items()}, count)
@@ -221,11 +206,11 @@ class DatasetWriter:
     ) -> dict[str, NDArray[np.generic]]:
         frame_index = np.arange(count, dtype=np.int64)
         state = columns[names.STATE_KEY]
-        wanted = state_values(list(state.T), STATE_NAMES, self._spec.state_names)
+        wanted = state_values(list(state.T), STATE_NAMES, self._state_names)
         return {
             **columns,
             names.STATE_KEY: np.stack(wanted, axis=1),
-            "timestamp": (frame_index / self._spec.fps).astype(np.float32),
+            "timestamp": (frame_index / self._fps).astype(np.float32),
             "frame_index": frame_index,
             "episode_index": np.full(count, self.episodes, np.int64),
             "index": self.rows + frame_index,
@@ -238,7 +223,7 @@ class DatasetWriter:
         video = f"videos/{names.CAMERA_KEY}/"
         return {
             "episode_index": self.episodes,
-            "tasks": [self._spec.task],
+            "tasks": [self._config.task],
             "length": count,
             "data/chunk_index": chunk,
             "data/file_index": file,
@@ -247,7 +232,7 @@ class DatasetWriter:
             f"{video}chunk_index": chunk,
             f"{video}file_index": file,
             f"{video}from_timestamp": 0.0,
-            f"{video}to_timestamp": count / self._spec.fps,
+            f"{video}to_timestamp": count / self._fps,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
@@ -258,10 +243,10 @@ class DatasetWriter:
             raise DatasetError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)
         episodes.parent.mkdir(parents=True)
-        pq.write_table(_tasks(self._spec.task), library_name(self._folder / names.TASKS))
+        pq.write_table(_tasks(self._config.task), library_name(self._folder / names.TASKS))
         pq.write_table(pa.Table.from_pylist(self._episodes), library_name(episodes))
         # One feature at a time, so that memory holds only one.
-        columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
+        columns = (name for name in self._features() if name != names.CAMERA_KEY)
         stats = {name: vector_stats(self._column(name)) for name in columns}
         stats[names.CAMERA_KEY] = colour_stats(self._colours, self.rows)
         lists: Json = {
@@ -281,7 +266,6 @@ class DatasetWriter:
         return np.asarray(values.to_numpy()).reshape(len(column), -1)
 
     def _info(self) -> dict[str, Json]:
-        spec = self._spec
         return {
             "codebase_version": names.CODEBASE_VERSION,
             "robot_type": "mavlink",
@@ -291,11 +275,39 @@ class DatasetWriter:
             "chunks_size": FILES_A_CHUNK,
             "data_files_size_in_mb": DATA_FILE_MB,
             "video_files_size_in_mb": VIDEO_FILE_MB,
-            "fps": spec.fps,
+            "fps": self._fps,
             "splits": {"train": f"0:{self.episodes}"},
             "data_path": names.DATA,
             "video_path": names.VIDEO,
-            "features": _features(spec),
+            "features": self._features(),
+        }
+
+    def _features(self) -> dict[str, Json]:
+        height, width = self._size or (0, 0)
+        camera: Json = {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": height,
+                "video.width": width,
+                "video.codec": "h264",
+                "video.pix_fmt": "yuv420p",
+                "video.fps": self._fps,
+                "video.channels": 3,
+                "is_depth_map": False,
+                "has_audio": False,
+            },
+        }
+        state_info: dict[str, Json] = {"info": {names.STATE_FRAME: self._state_frame}}
+        return {
+            names.CAMERA_KEY: camera,
+            names.STATE_KEY: _feature("float32", self._state_names) | state_info,
+            names.ACTION_KEY: _feature("float32", ACTION_NAMES),
+            names.SENT: _feature("float32", ACTION_NAMES),
+            **{name: _feature("int64") for name in names.STAMPS},
+            "timestamp": _feature("float32"),
+            **{name: _feature("int64") for name in _ROW_NUMBERS},
         }
 
 
@@ -326,34 +338,6 @@ def _tasks(task: str) -> pa.Table:
     pandas: Json = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
     table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def _features(spec: DatasetSpec) -> dict[str, Json]:
-    camera: Json = {
-        "dtype": "video",
-        "shape": [spec.height, spec.width, 3],
-        "names": ["height", "width", "channels"],
-        "info": {
-            "video.height": spec.height,
-            "video.width": spec.width,
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.fps": spec.fps,
-            "video.channels": 3,
-            "is_depth_map": False,
-            "has_audio": False,
-        },
-    }
-    state = _feature("float32", spec.state_names) | {"info": {names.STATE_FRAME: spec.state_frame}}
-    return {
-        names.CAMERA_KEY: camera,
-        names.STATE_KEY: state,
-        names.ACTION_KEY: _feature("float32", ACTION_NAMES),
-        names.SENT: _feature("float32", ACTION_NAMES),
-        **{name: _feature("int64") for name in names.STAMPS},
-        "timestamp": _feature("float32"),
-        **{name: _feature("int64") for name in _ROW_NUMBERS},
-    }
 
 
 def _feature(dtype: str, columns: tuple[str, ...] = ()) -> dict[str, Json]:
