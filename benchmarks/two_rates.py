@@ -212,13 +212,13 @@ def draw(cells: list[Cell], path: Path) -> None:
 
     A control flown with a single encoder has no panel.
     """
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
     flown = Counter(control for control, _ in {(c.control, c.encoder_ms): None for c in cells})
     names = [name for name, count in flown.items() if count > 1] or list(flown)
     encoders_ms = sorted({cell.encoder_ms for cell in cells})
-    with rc_context(FIGURE_STYLE):
+    with style.context(FIGURE_STYLE):
         rows = math.ceil(len(names) / PANELS_A_ROW)
         columns = min(len(names), PANELS_A_ROW)
         size = (6.0 * columns, 4.6 * rows)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -24,26 +23,10 @@ from policy.errors import require_packages
 PIPED_WIDTH = 120
 """Columns of the tables if there is no terminal."""
 PICTURES = (".png", ".svg", ".pdf")
-INK, MUTED, GRID, GREY = "#1f2933", "#6b7885", "#dfe4ea", "#a9b4bf"
-BLUE, RED = "#2b6cb0", "#d1495b"
+MUTED, GREY, BLUE, RED = "#6b7885", "#a9b4bf", "#2b6cb0", "#d1495b"
 FIGURE_DPI = 150
-FIGURE_STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "text.color": INK,
-    "axes.labelcolor": MUTED,
-    "axes.edgecolor": GRID,
-    "axes.titlesize": 12,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": GRID,
-    "xtick.color": MUTED,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
+FIGURE_STYLE = "seaborn-v0_8-whitegrid"
+"""One of matplotlib's own styles."""
 
 
 def require_outputs(json_file: Path | None, plot: Path | None) -> None:

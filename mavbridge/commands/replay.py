@@ -372,12 +372,12 @@ def as_document(result: ReplayResult) -> dict[str, object]:
 
 def draw(result: ReplayResult, path: Path) -> None:
     """Draw the smoothed sticks, recorded and replayed, over time: one row per stick."""
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
     names = ACTION_CLASSES[result.source.contract.action]._fields
     sticks = result.sticks
-    with rc_context(FIGURE_STYLE):
+    with style.context(FIGURE_STYLE):
         figure = Figure(figsize=(12.0, 8.0), dpi=FIGURE_DPI, facecolor="white")
         rows = figure.subplots(4, 1, sharex=True)
         for number, (axes, name) in enumerate(zip(rows, names, strict=True)):
