@@ -24,7 +24,13 @@ from mavbridge.commands.record.episodes import (
     disk_left_gb,
     prepare_out,
 )
-from mavbridge.commands.record.view import CONTRACT, STICKS_FRESH_NS, PilotView, RecordScreen, Shown
+from mavbridge.commands.record.view import (
+    CONTRACT,
+    STICKS_FRESH_NS,
+    PilotView,
+    RecordScreen,
+    session_status,
+)
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
@@ -51,8 +57,6 @@ from mavbridge.recording.folder import FlightMeta
 STEP_S = 0.05
 MAX_KEYS = 64
 """Capacity of the queue of keys for the next step; the oldest are dropped first."""
-DISK_NS = NS_PER_S
-"""Time between two checks of the disk."""
 JOIN_S = 2.0
 RERUN_CAPACITY = 1000
 GUARD_END_S = 5.0
@@ -108,7 +112,7 @@ class _Session:
         self._control = EpisodeControl(
             has_switch=config.episode_channel is not None, on_arm=config.on_arm
         )
-        self._disk_gb, self._disk_due_ns = 0.0, 0
+        self._disk_gb = 0.0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
         self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.visual_rate)
@@ -241,17 +245,15 @@ class _Session:
             self._episodes.end("a key")
             return False
         self._follow()
-        config, episode, counts = self._config, self._episodes.current, self._episodes.counts
-        self._screen.shown = Shown(
-            number=self._episodes.number,
-            duration_ns=None if episode is None else self._clock.now_ns() - episode.begin_ns,
-            counts=counts,
+        self._screen.sticks.set(self._view.stick_packets, self._view.sticks_ns)
+        self._screen.shown = session_status(
+            self._episodes,
+            now_ns=self._clock.now_ns(),
             disk_gb=self._disk_gb,
-            stick_packets=self._view.stick_packets,
-            sticks_ns=self._view.sticks_ns,
             problem=self._missing() or self._doubt(),
         )
-        return config.episodes is None or counts.total() < config.episodes
+        wanted = self._config.episodes
+        return wanted is None or self._episodes.counts.total() < wanted
 
     def _follow(self) -> None:
         """Begin or end an episode as the control wants it."""
@@ -302,10 +304,6 @@ class _Session:
         return None
 
     def _look_at_disk(self) -> None:
-        now_ns = self._clock.now_ns()
-        if now_ns < self._disk_due_ns:
-            return
-        self._disk_due_ns = now_ns + DISK_NS
         self._disk_gb = disk_left_gb(self._config.out, self._config.disk_reserve)
         if self._disk_gb == 0.0:
             self._control.wanted = None

@@ -1,12 +1,12 @@
 """The vehicle during a recording, and the status line of the terminal."""
 
 import threading
-from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rich.console import Console
 from rich.text import Text
 
+from mavbridge.commands.record.episodes import Episodes
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, Tick, TickSink
@@ -76,32 +76,17 @@ LOW_GB = 1.0
 """Room on the disk below which it is shown as a warning."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shown:
-    """Contents of the status line besides the newest tick."""
-
-    number: int
-    duration_ns: int | None
-    """Length of the current episode; None while none is recorded."""
-    counts: Counter[bool | None]
-    """Number of good, bad and unmarked episodes."""
-    disk_gb: float
-    """Room on the disk above --disk-reserve."""
-    stick_packets: int
-    sticks_ns: int
-    """Number of packets with the pilot's sticks so far, and the arrival of the newest."""
-    problem: str | None
-    """A missing requirement, or a doubt about the value of the recording."""
-
-
 class RecordScreen(FlightScreen):
     """``FlightScreen`` with a status line for the pilot. Any thread can replace ``shown``."""
 
     def __init__(self, console: Console, *, rate_hz: float, vision_hz: float) -> None:
         super().__init__(console, action_hz=rate_hz, vision_hz=vision_hz, readonly=True)
-        self.shown: Shown | None = None
+        self.shown: tuple[Text, Text] | None = None
+        """Begin and end of the status line; see ``session_status``."""
+        self.sticks = RateMeter()
+        """Packets with the pilot's sticks."""
         self._wanted_hz = (rate_hz, vision_hz)
-        self._states, self._images, self._sticks = RateMeter(), RateMeter(), RateMeter()
+        self._states, self._images = RateMeter(), RateMeter()
         self._newest: Tick | None = None
         self._state_ns = 0
 
@@ -120,21 +105,15 @@ class RecordScreen(FlightScreen):
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
         shown, tick = self.shown, self._newest
-        line = Text(no_wrap=True, overflow="ellipsis")
         if shown is None or tick is None:
-            line.append("waiting for the vehicle", style="dim")
-            return line
-        if shown.duration_ns is None:
-            line.append(f"next: episode {shown.number}", style="bold yellow")
-        else:
-            seconds = shown.duration_ns / NS_PER_S
-            line.append(f"RECORDING episode {shown.number} {seconds:5.1f} s", style="bold red")
+            return Text("waiting for the vehicle", style="dim")
+        line = Text(no_wrap=True, overflow="ellipsis")
+        line.append(shown[0])
         line.append(f"  {tick.mode or 'mode unknown'} {'armed' if tick.armed else 'disarmed'}")
         line.append(f"  {_sticks(tick.rc_sticks)}")
-        self._sticks.set(shown.stick_packets, shown.sticks_ns)
         rate_hz, vision_hz = self._wanted_hz
         for name, meter, wanted_hz in (
-            ("sticks", self._sticks, None),
+            ("sticks", self.sticks, None),
             ("state", self._states, rate_hz),
             ("camera", self._images, vision_hz),
         ):
@@ -142,13 +121,29 @@ class RecordScreen(FlightScreen):
             line.append(f"  {name} ")
             style = "" if wanted_hz is None else rate_style(hz, wanted_hz)
             line.append(f"{number(hz, 1)} Hz", style=style)
-        style = "yellow" if shown.disk_gb < LOW_GB else ""
-        line.append(f"  disk {shown.disk_gb:.1f} GB", style=style)
-        counts = shown.counts
-        line.append(f"  {counts[True]} good {counts[False]} bad {counts[None]} unmarked")
-        if shown.problem is not None:
-            line.append(f"  {shown.problem}", style="bold yellow")
-        return line
+        return line.append(shown[1])
+
+
+def session_status(
+    episodes: Episodes, *, now_ns: int, disk_gb: float, problem: str | None
+) -> tuple[Text, Text]:
+    """Return the begin and the end of the status line.
+
+    ``disk_gb`` is the room above --disk-reserve; ``problem`` a missing requirement, or a doubt
+    about the value of the recording.
+    """
+    if episodes.current is None:
+        begin = Text(f"next: episode {episodes.number}", style="bold yellow")
+    else:
+        seconds = (now_ns - episodes.current.begin_ns) / NS_PER_S
+        begin = Text(f"RECORDING episode {episodes.number} {seconds:5.1f} s", style="bold red")
+    counts = episodes.counts
+    end = Text.assemble(
+        (f"  disk {disk_gb:.1f} GB", "yellow" if disk_gb < LOW_GB else ""),
+        f"  {counts[True]} good {counts[False]} bad {counts[None]} unmarked",
+        ("" if problem is None else f"  {problem}", "bold yellow"),
+    )
+    return begin, end
 
 
 def _sticks(sticks: Sticks | None) -> str:

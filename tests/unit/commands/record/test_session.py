@@ -7,8 +7,9 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -18,7 +19,7 @@ from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.commands.config import ListenConfig, RecordConfig
 from mavbridge.commands.record.run import CONTRACT, listening_guard, pilot_flight
-from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, Shown
+from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, session_status
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
@@ -125,20 +126,15 @@ def test_the_status_line_tells_state_number_marks_sticks_and_disk() -> None:
     screen = RecordScreen(Console(file=io.StringIO()), rate_hz=100.0, vision_hz=30.0)
     assert "waiting for the vehicle" in screen.status_line().plain
     screen.emit(make_tick(0, rc_sticks=Sticks(0.1, -0.2, 0.3, -1.0)))
-    screen.shown = shown = Shown(
-        number=3,
-        duration_ns=None,
-        counts=Counter({True: 2, None: 1}),
-        disk_gb=4.04,
-        stick_packets=0,
-        sticks_ns=0,
-        problem=None,
-    )
+    episodes = SimpleNamespace(number=3, current=None, counts=Counter({True: 2, None: 1}))
+    screen.shown = session_status(episodes, now_ns=0, disk_gb=4.04, problem=None)
     line = screen.status_line().plain
     sticks = "T+0.10 Y-0.20 P+0.30 R-1.00"
     for part in ("next: episode 3", sticks, "disk 4.0 GB", "2 good 0 bad 1 unmarked"):
         assert part in line
-    screen.shown = replace(shown, duration_ns=12 * NS_PER_S, problem="no sticks of a pilot")
+    episodes.current = SimpleNamespace(begin_ns=START_NS)
+    now_ns, problem = START_NS + 12 * NS_PER_S, "no sticks of a pilot"
+    screen.shown = session_status(episodes, now_ns=now_ns, disk_gb=4.04, problem=problem)
     screen.emit(make_tick(1, rc_sticks=None))
     line = screen.status_line().plain
     assert "RECORDING episode 3  12.0 s" in line
