@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -34,26 +33,12 @@ from mavbridge.observe.viewer_target import check_target
 from mavbridge.recording.flight_folder import RecordedFlight
 
 HOLDERS_SHOWN = 12
-NOTABLE = 0.1
-"""Relative difference between two flights' figures that is marked."""
 _SOURCES = {
     "flight": "a policy's flight",
     "demonstration": "a demonstration by the expert",
     "dagger": "a flight by the policy, with the expert's labels",
     "pilot": "a pilot's flight",
 }
-
-
-class Figure(NamedTuple):
-    """One row of the comparison of two flights."""
-
-    name: str
-    unit: str
-    value: float | None
-    """None: not measured."""
-    digits: int = 1
-    more_is_better: bool | None = False
-    """None: neither is better."""
 
 
 def print_flight(flight: FlightAnalysis, console: Console) -> None:
@@ -104,7 +89,7 @@ def _moments_table(flight: FlightAnalysis) -> Table | Text:
 
 
 def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> None:
-    """Print two flights side by side; differences from a tenth on are marked better or worse."""
+    """Print two flights side by side, and by how much the figures of the second differ."""
     first, second = flights
     table = Table(title="Two flights", title_justify="left")
     table.add_column("", no_wrap=True)
@@ -116,15 +101,11 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
     for (label, one), (_, other) in zip(_texts(first), _texts(second), strict=True):
         table.add_row(label, Text(one), Text(other), "" if one == other else "differs")
     table.add_section()
-    for one_figure, other_figure in zip(_figures(first), _figures(second), strict=True):
-        if one_figure.value is None and other_figure.value is None:
-            continue
-        table.add_row(
-            Text(f"{one_figure.name}{one_figure.unit and f' [{one_figure.unit}]'}"),
-            number(one_figure.value, one_figure.digits),
-            number(other_figure.value, one_figure.digits),
-            _difference(one_figure, other_figure.value),
-        )
+    pairs = zip(_figures(first), _figures(second), strict=True)
+    for (label, value, digits), (_, of_second, _) in pairs:
+        if value is not None or of_second is not None:
+            shown = number(value, digits), number(of_second, digits)
+            table.add_row(Text(label), *shown, _difference(value, of_second, digits))
     console.print(table)
     for flight in flights:
         for text in flight.damage:
@@ -141,44 +122,34 @@ def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:
     yield "ended", end if meta.crash is None else "crashed"
 
 
-def _difference(figure: Figure, other: float | None) -> Text:
-    one = figure.value
+def _difference(one: float | None, other: float | None, digits: int) -> str:
     if one is None or other is None:
-        return Text("-")
+        return "-"
     if one == other:
-        return Text("=")
-    if not one:
-        is_notable, shown = True, f"{other - one:+.{figure.digits}f}"
-    else:
-        is_notable, shown = abs(other / one - 1) >= NOTABLE, f"{other / one - 1:+.0%}"
-    if not is_notable or figure.more_is_better is None:
-        return Text(shown)
-    if (other > one) == figure.more_is_better:
-        return Text(f"{shown} better", style="green")
-    return Text(f"{shown} worse", style="red")
+        return "="
+    return f"{other / one - 1:+.0%}" if one else f"{other:+.{digits}f}"
 
 
-def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
-    """Yield the compared figures, in the order of the rows; the same ones for every flight."""
+def _figures(flight: FlightAnalysis) -> Iterator[tuple[str, float | None, int]]:
+    """Yield name, value and digits of the compared figures, the same ones for every flight."""
     report, sticks, action = flight.report, flight.report.sticks, flight.report.action
-    yield Figure("duration", "s", report.duration_s, more_is_better=None)
-    yield Figure("flown by the policy", "s", sticks.flying_s, more_is_better=None)
-    yield Figure("sticks", "1/s", sticks.rate_hz, more_is_better=None)
-    yield Figure("chunks", "1/s", action.rate_hz, more_is_better=True)
-    yield Figure("images", "1/s", report.vision.rate_hz, more_is_better=True)
-    yield Figure("missed slots", "", sticks.missed_slots, 0)
-    yield Figure("late chunks", "", action.late_chunks, 0)
-    yield Figure("sends coasting", "", sticks.coasting_sends, 0)
-    yield Figure("releases", "", report.release_count, 0)
+    yield "duration [s]", report.duration_s, 1
+    yield "flown by the policy [s]", sticks.flying_s, 1
+    yield "sticks [1/s]", sticks.rate_hz, 1
+    yield "chunks [1/s]", action.rate_hz, 1
+    yield "images [1/s]", report.vision.rate_hz, 1
+    yield "missed slots", sticks.missed_slots, 0
+    yield "late chunks", action.late_chunks, 0
+    yield "sends coasting", sticks.coasting_sends, 0
+    yield "releases", report.release_count, 0
     for name, measured in flight.times_ms.items():
-        yield Figure(f"{name}, p50", "ms", None if measured is None else measured.p50, 2)
-        yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
-    path_m = flight.track.length_m if flight.track else None
-    yield Figure("path", "m", path_m, more_is_better=None)
+        yield f"{name}, p50 [ms]", None if measured is None else measured.p50, 2
+        yield f"{name}, p99 [ms]", None if measured is None else measured.p99, 2
+    yield "path [m]", flight.track.length_m if flight.track else None, 1
     gates_passed, outcome = flight.meta.gates_passed, flight.meta.outcome
     if gates_passed is None and outcome is not None:
         gates_passed = outcome.gates_passed
-    yield Figure("gates passed", "", gates_passed, 0, more_is_better=True)
+    yield "gates passed", gates_passed, 0
 
 
 MAX_FLIGHTS = 2

@@ -152,8 +152,8 @@ def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Pat
     cells = [[cell.strip() for cell in line.split("│")] for line in lines if "│" in line]
     rows = {name: values for _, name, *values in cells}
     assert rows["policy"][:3] == ["scripted:hover", "toge", "differs"]
-    assert rows["late chunks"][:3] == ["1", "0", "-100% better"]
-    assert rows["predict, p50 [ms]"][2] == "+100% worse"
+    assert rows["late chunks"][:3] == ["1", "0", "-100%"]
+    assert rows["predict, p50 [ms]"][2] == "+100%"
     assert rows["gates passed"][:2] == ["-", "5"]
     assert rows["path [m]"][:3] == ["8.8", "-", "-"], "no position is no path of 0 m"
 
