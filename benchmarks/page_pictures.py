@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import rerun.blueprint as rrb
 
-from mavbridge.commands.inspect.analysis import analyse
+from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.page import write_page
 from mavbridge.observe.viewer_layout import timing_page
 
@@ -34,7 +34,7 @@ def main() -> None:
         assert image is not None  # rerun has written it
         small = cv2.resize(image, SIZE_PX, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(out / "timing.png"), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        write_page(page, [analyse(flight, gates=gates)])
+        write_page(page, [FlightAnalysis(flight, gates=gates)])
         flags = ("--headless", "--no-sandbox", "--hide-scrollbars", f"--window-size={PAGE_PX}")
         wait = "--virtual-time-budget=8000"
         _run("chromium", *flags, wait, f"--screenshot={out / 'inspect.png'}", page.as_uri())

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from helpers.fakes import FakeClock
 from mavbridge.camera.shared_memory import HEADER, MAGIC, SharedMemoryCamera
-from mavbridge.commands.inspect.analysis import analyse
+from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import read_meta
@@ -80,7 +80,7 @@ def read(folder: Path) -> None:
     list(flight.frame_rows())
 
 
-@pytest.mark.parametrize("use", [read, open_source, analyse])
+@pytest.mark.parametrize("use", [read, open_source, FlightAnalysis])
 @settings(BOUNDED, max_examples=40)
 @given(name=st.sampled_from(FILES), damage=damages)
 def test_a_damaged_recording_is_used_or_refused(

@@ -11,13 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from mavbridge.commands.inspect.moments import (
-    Arrivals,
-    Moment,
-    find_delays,
-    is_gap,
-    worst_moments,
-)
+from mavbridge.commands.inspect.moments import Arrivals, find_delays, is_gap, worst_moments
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, read_gates
@@ -117,54 +111,49 @@ class Track:
         return float(steps_m.sum())
 
 
-@dataclass(frozen=True, kw_only=True)
 class FlightAnalysis:
     """One recorded flight."""
 
-    cameras: dict[str, RecordedFlight]
-    """The recording with the images of each camera, by name, in the contract's order."""
-    start_ns: int
-    """Wake-up of the first tick, on the clock of all stamps."""
-    stick_hz: float
-    """Rate of the stick grid, derived from the slots themselves."""
-    report: TimingReport
-    """Figures of the table that ended the flight, except for those of the link; vision is that of
-    the first camera."""
-    image_latency_ms: dict[str, Percentiles | None]
-    """Time from the exposure to the finished feature, by camera; None without images."""
-    track: Track | None
-    """None if no position is known."""
-    gates: tuple[CourseGate, ...]
-    """Empty if the course is unknown."""
-    holders: tuple[HolderSpan, ...]
-    delays: tuple[Moment, ...]
-    """Missed slots and late chunks in the order of time, each with its cause."""
-    moments: tuple[Moment, ...]
-    """The ten worst, starting with the worst."""
-    limits: FreshnessLimits
-    """Maximum ages when a stick is sent."""
-    damage: tuple[str, ...]
-    """Skipped parts of the recording, in sentences for the user."""
-
-    @property
-    def recorded(self) -> RecordedFlight:
+    def __init__(self, folder: Path, *, gates: Path | None = None) -> None:
+        """Read the flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
+        opened = open_cameras(folder)
+        self.folder = folder
+        self.recorded = opened[0]
         """The recording, with the images of its first camera."""
-        return next(iter(self.cameras.values()))
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the flight."""
-        return self.recorded.folder
-
-    @property
-    def meta(self) -> FlightMeta:
-        """Facts about the flight."""
-        return self.recorded.meta
-
-    @property
-    def ticks(self) -> pa.Table:
-        """Table of all N ticks."""
-        return self.recorded.ticks
+        self.meta = meta = self.recorded.meta
+        self.ticks: pa.Table = self.recorded.ticks
+        self.cameras = dict(zip(meta.contract.cameras, opened, strict=True))
+        """The recording with the images of each camera, by name, in the contract's order."""
+        ticks = [row.tick for row in self.recorded.tick_rows()]
+        frames = list(self.recorded.frame_rows())
+        damage = [text for camera in opened for text in camera.damage]
+        self.start_ns = ticks[0].woke_ns if ticks else meta.start_ns
+        """Wake-up of the first tick, on the clock of all stamps."""
+        self.stick_hz = _stick_hz(ticks, meta)
+        """Rate of the stick grid, derived from the slots themselves."""
+        self.report = _report(opened, ticks, frames, self.stick_hz)
+        """Figures of the table that ended the flight, except for those of the link; vision is that
+        of the first camera."""
+        self.image_latency_ms = {name: _latency_ms(each) for name, each in self.cameras.items()}
+        """Time from the exposure to the finished feature, by camera; None without images."""
+        self.track = _track(ticks, frames, self.start_ns)
+        """None if no position is known."""
+        self.gates = course_gates(meta.course_seed) if gates is None else read_gates(gates)
+        """Empty if the course is unknown."""
+        self.holders = holder_spans(ticks, self.start_ns, keeps_neutral=meta.keeps_neutral)
+        self.delays = find_delays(
+            ticks,
+            stick_hz=self.stick_hz,
+            action_hz=meta.action_hz,
+            arrivals=_read_arrivals(folder, damage),
+        )
+        """Missed slots and late chunks in the order of time, each with its cause."""
+        self.limits = _flown_limits(folder, meta.contract)
+        """Maximum ages when a stick is sent."""
+        self.moments = worst_moments(self.cameras, ticks, self.delays, self.limits)
+        """The ten worst, starting with the worst."""
+        self.damage = tuple(dict.fromkeys(damage))
+        """Skipped parts of the recording, in sentences for the user."""
 
     @property
     def times_ms(self) -> dict[str, Percentiles | None]:
@@ -180,40 +169,6 @@ class FlightAnalysis:
             if delay.cause is not None:
                 counts[delay.cause] += delay.count
         return tuple(counts.most_common())
-
-
-def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
-    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
-    opened = open_cameras(folder)
-    flight = opened[0]
-    contract = flight.meta.contract
-    cameras = dict(zip(contract.cameras, opened, strict=True))
-    ticks = [row.tick for row in flight.tick_rows()]
-    frames = list(flight.frame_rows())
-    damage = [text for camera in cameras.values() for text in camera.damage]
-    start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
-    stick_hz = _stick_hz(ticks, flight.meta)
-    delays = find_delays(
-        ticks,
-        stick_hz=stick_hz,
-        action_hz=flight.meta.action_hz,
-        arrivals=_read_arrivals(folder, damage),
-    )
-    limits = _flown_limits(folder, contract)
-    return FlightAnalysis(
-        cameras=cameras,
-        start_ns=start_ns,
-        stick_hz=stick_hz,
-        report=_report(opened, ticks, frames, stick_hz),
-        image_latency_ms={name: _image_latency_ms(each) for name, each in cameras.items()},
-        track=_track(ticks, frames, start_ns),
-        gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
-        holders=holder_spans(ticks, start_ns, keeps_neutral=flight.meta.keeps_neutral),
-        delays=delays,
-        moments=worst_moments(flight, ticks, delays, limits, cameras),
-        limits=limits,
-        damage=tuple(dict.fromkeys(damage)),
-    )
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
@@ -282,7 +237,7 @@ def _vision(frames: Sequence[FrameRow], visual_hz: float) -> VisionReport:
     )
 
 
-def _image_latency_ms(camera: RecordedFlight) -> Percentiles | None:
+def _latency_ms(camera: RecordedFlight) -> Percentiles | None:
     latency = Histogram()
     for frame in camera.frame_rows():
         latency.add(frame.ready_ns - frame.captured_ns)
@@ -388,11 +343,6 @@ def _pilot_findings(flight: FlightAnalysis) -> Iterator[Finding]:
     rows_hz = (len(sticks) - 1) / report.duration_s if is_timed else None
     known = 1 - sticks.null_count / max(len(sticks), 1)
     share = f", the pilot's sticks known in {known:.1%} of them" if len(sticks) else ""
-    for name, rate_hz, target_hz, rest in (
-        ("rows", rows_hz, flight.meta.action_hz, share),
-        ("vision", report.vision.rate_hz, report.vision.target_hz, ""),
-    ):
-        text = f"{number(rate_hz, 1)} Hz of {target_hz:.4g} Hz{rest}"
-        yield Finding(name, text, rate_style(rate_hz, target_hz))
-    if report.observer_drops.recorder:
-        yield Finding("recorder", f"missed {report.observer_drops.recorder} events", POOR)
+    text = f"{number(rows_hz, 1)} Hz of {flight.meta.action_hz:.4g} Hz{share}"
+    yield Finding("rows", text, rate_style(rows_hz, flight.meta.action_hz))
+    yield from (each for each in findings(report) if each.name in ("vision", "recorder"))

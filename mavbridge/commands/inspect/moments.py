@@ -168,11 +168,10 @@ def _arrival_ns(
 
 
 def worst_moments(
-    flight: RecordedFlight,
+    cameras: Mapping[str, RecordedFlight],
     ticks: Sequence[Tick],
     delays: Sequence[Moment],
     limits: FreshnessLimits,
-    cameras: Mapping[str, RecordedFlight],
 ) -> tuple[Moment, ...]:
     """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
 
@@ -181,6 +180,7 @@ def worst_moments(
     """
     if not ticks:
         return ()
+    flight = next(iter(cameras.values()))
     moments = [
         *_crash(flight, ticks),
         *_ends(ticks),

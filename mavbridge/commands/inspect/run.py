@@ -13,7 +13,6 @@ from rich.text import Text
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import (
     FlightAnalysis,
-    analyse,
     flight_facts,
     flight_findings,
     recorded_solves,
@@ -166,7 +165,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
     require_writable(config.html, "--html")
     require_writable(config.json, "--json")
     check_target(config.rerun)
-    analyses = [analyse(folder, gates=config.gates) for folder in flights]
+    analyses = [FlightAnalysis(folder, gates=config.gates) for folder in flights]
     console = table_console()
     if len(analyses) == 1:
         print_flight(analyses[0], console)

@@ -17,7 +17,7 @@ from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.programs import ended
 from helpers.recordings import make_frame, make_meta, write_recording
 from mavbridge.commands.config import InspectConfig
-from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
+from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.page import page_data
 from mavbridge.commands.inspect.run import _events as events_of
 from mavbridge.commands.inspect.run import inspect, print_comparison, print_flight
@@ -80,7 +80,7 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_one_flight_is_told_with_its_figures_causes_and_moments(
     stalled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flight = analyse(stalled)
+    flight = FlightAnalysis(stalled)
     assert [moment.what for moment in flight.moments] == ["the policy's flight ended", "late chunk"]
     assert flight.moments[0].t_s == pytest.approx(0.9)
     text = shown(flight)
@@ -114,7 +114,7 @@ def test_plots_hold_what_was_sent_and_axes_of_ros_become_ned_axes(tmp_path: Path
     place = Position(1, 2, -3)
     ticks = [make_tick(k, state=_aged(k, values), position_ned_m=place) for k in range(3)]
     meta = make_meta(contract=Contract(state_frame="enu_flu"))
-    (page,) = json.loads(page_data([analyse(write(tmp_path / "flight", ticks, meta=meta))]))
+    (page,) = json.loads(page_data([FlightAnalysis(write(tmp_path / "flight", ticks, meta=meta))]))
     last = {
         plot["title"]: [
             np.frombuffer(b64decode(each["values"]), "<f4")[-1] for each in plot["series"]
@@ -138,7 +138,7 @@ def test_chunks_that_stand_for_most_slots_do_not_change_the_stick_rate(tmp_path:
         tick if tick.index % 3 == 0 else replace(tick, is_slot=False, index=-1)
         for tick in flown(100)
     ]
-    assert analyse(write(tmp_path / "flight", ticks)).stick_hz == 100.0
+    assert FlightAnalysis(write(tmp_path / "flight", ticks)).stick_hz == 100.0
 
 
 def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Path) -> None:
@@ -146,8 +146,8 @@ def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Pat
     outcome = read_meta(GOLDEN / "toge_ardupilot").outcome
     assert outcome is not None
     meta = make_meta(policy="toge").with_outcome(replace(outcome, gates_passed=5))
-    second = analyse(write(tmp_path / "second", steady, meta=meta))
-    lines = shown(analyse(stalled), second).splitlines()
+    second = FlightAnalysis(write(tmp_path / "second", steady, meta=meta))
+    lines = shown(FlightAnalysis(stalled), second).splitlines()
     assert all(len(line) <= 80 for line in lines)
     cells = [[cell.strip() for cell in line.split("│")] for line in lines if "│" in line]
     rows = {name: values for _, name, *values in cells}
@@ -160,14 +160,14 @@ def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Pat
 
 def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
     folder = write(tmp_path / "flight", [make_tick(0)], meta=make_meta(course_seed=3))
-    assert len(analyse(folder).gates) == 8
+    assert len(FlightAnalysis(folder).gates) == 8
     named = tmp_path / "gates.json"
     named.write_text('{"gates": [{"center_ned_m": [1, 2, -3], "yaw_rad": 0.5, "size_m": 2}]}')
-    assert analyse(folder, gates=named).gates == (CourseGate(Position(1, 2, -3), 0.5, 2),)
+    assert FlightAnalysis(folder, gates=named).gates == (CourseGate(Position(1, 2, -3), 0.5, 2),)
 
 
 def moments_of(folder: Path, ticks: list[Tick], **changes: object) -> list[tuple[str, str]]:
-    flight = analyse(write(folder, ticks, frames=0, meta=make_meta(**changes)))
+    flight = FlightAnalysis(write(folder, ticks, frames=0, meta=make_meta(**changes)))
     return [(moment.what, moment.detail) for moment in flight.moments]
 
 
@@ -216,7 +216,7 @@ def test_close_moments_are_told_as_one(tmp_path: Path) -> None:
 def test_a_crash_is_a_moment_with_its_time(tmp_path: Path) -> None:
     ticks = flown(100)
     ticks[60] = replace(ticks[60], texts=("vehicle: Crash: Disarming",))
-    flight = analyse(
+    flight = FlightAnalysis(
         write(tmp_path / "flight", ticks, frames=0, meta=make_meta(crash="the vehicle said so"))
     )
     assert [(moment.what, moment.t_s) for moment in flight.moments] == [("crash", 0.6)]
@@ -225,7 +225,7 @@ def test_a_crash_is_a_moment_with_its_time(tmp_path: Path) -> None:
 def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: Path) -> None:
     frames = [make_frame(number) for number in range(15, 30)]
     ticks = [make_tick(index) for index in (*range(50), *range(550, 600))]
-    flight = analyse(write(tmp_path / "flight", [*frames, *ticks], finish=False))
+    flight = FlightAnalysis(write(tmp_path / "flight", [*frames, *ticks], finish=False))
     assert flight.report.sticks.rate_hz == pytest.approx(100)
     assert flight.report.sticks.flying_s == pytest.approx(0.98)
     assert flight.report.vision.rate_hz == pytest.approx(30, abs=0.01)
@@ -246,7 +246,7 @@ def test_a_gap_of_any_camera_is_a_moment(
     folder = write(
         tmp_path / "flight", [*late, *flown(90)], frames=27, meta=make_meta(contract=contract)
     )
-    told = [(each.what, each.detail) for each in analyse(folder).moments]
+    told = [(each.what, each.detail) for each in FlightAnalysis(folder).moments]
     detail = "433 ms without an exposure of camera down that was used"
     assert told == [("gap between images", detail)] * gaps
 
@@ -257,7 +257,7 @@ def test_all_cameras_are_told_and_shown(tmp_path: Path, is_whole: bool) -> None:
     events = [make_frame(number, camera=1) for number in (0, 1, 3, 4)] + flown(20)
     meta = make_meta(contract=contract)
     folder = write(tmp_path / "flight", events, frames=6, meta=meta, finish=is_whole)
-    flight = analyse(folder)
+    flight = FlightAnalysis(folder)
     rows = {name: camera.frames.num_rows for name, camera in flight.cameras.items()}
     assert rows == {"front": 6, "down": 4}
     assert "down: p50" in shown(flight)
@@ -279,14 +279,14 @@ def test_facts_that_nothing_can_be_counted_with_are_refused_by_name(
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | damage))
     with pytest.raises(MavbridgeError, match=f"meta.json: {next(iter(damage))} is"):
-        analyse(folder)
+        FlightAnalysis(folder)
 
 
 def test_a_pilots_flight_is_judged_by_its_rows_alone(tmp_path: Path) -> None:
     ticks = [make_released_tick(k, because(Code.PILOT_FLIES), phase="released") for k in range(100)]
     ticks[10:20] = [replace(tick, rc_sticks=None) for tick in ticks[10:20]]
     meta = make_meta(source="pilot", policy=None, engine=None)
-    text = shown(analyse(write(tmp_path / "flight", ticks, frames=30, meta=meta)))
+    text = shown(FlightAnalysis(write(tmp_path / "flight", ticks, frames=30, meta=meta)))
     assert "100.0 Hz of 100 Hz, the pilot's sticks known in 90.0% of them" in text
     assert "30.0 Hz of 30 Hz" in text
     assert "no moment went wrong" in text
@@ -300,7 +300,7 @@ def test_recorded_flights_are_told_as_their_columns_have_it(tmp_path: Path, name
     shutil.copytree(GOLDEN / name, folder)  # which leave out the images
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | {"frames": 0}))
-    flight = analyse(folder)
+    flight = FlightAnalysis(folder)
     sends = sum(row.tick.trace is not None for row in open_flight(folder).tick_rows())
     assert flight.report.sticks.sends == sends > 100
     assert sum(count for _, count in flight.causes) == (

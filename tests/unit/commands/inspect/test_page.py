@@ -3,7 +3,6 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from helpers.factories import make_released_tick, make_tick
 from helpers.recordings import make_frame, make_meta, write_recording
-from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
+from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.page import write_page
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
@@ -32,7 +31,9 @@ def flight(folder: Path, *, name: str = "scripted:hover", frames: int = 10) -> F
     end = make_released_tick(40, because(Code.POLICY_REFUSED, said=NASTY), phase="released")
     events = [*map(make_frame, range(frames)), *ticks, end]
     write_recording(folder, events, meta=make_meta(policy=name))
-    return replace(analyse(folder), gates=(CourseGate(Position(5, 0, -2), 0.1, 2.4),))
+    analysis = FlightAnalysis(folder)
+    analysis.gates = (CourseGate(Position(5, 0, -2), 0.1, 2.4),)
+    return analysis
 
 
 def data_of(text: str) -> list[dict[str, Any]]:
@@ -83,7 +84,7 @@ def test_a_video_that_browsers_do_not_play_is_not_put_into_the_page(tmp_path: Pa
     frames = [make_frame(k, rgb=np.full((48, 64), k, np.uint16)) for k in range(5)]
     meta = make_meta(contract=Contract(image_channels="depth"))
     write_recording(tmp_path / "depth", [*frames, make_tick(0)], meta=meta)
-    write_page(tmp_path / "page.html", [analyse(tmp_path / "depth")])
+    write_page(tmp_path / "page.html", [FlightAnalysis(tmp_path / "depth")])
     (shown,) = data_of((tmp_path / "page.html").read_text())
     assert list(shown["video"]) == ["note"]
     assert "camera.mp4 holds depth" in shown["video"]["note"]
@@ -91,10 +92,8 @@ def test_a_video_that_browsers_do_not_play_is_not_put_into_the_page(tmp_path: Pa
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")
 def test_a_browser_draws_it_to_the_end(tmp_path: Path) -> None:
-    flights = [
-        flight(tmp_path / "one"),
-        replace(flight(tmp_path / "two", name=NASTY, frames=0), track=None),
-    ]
+    flights = [flight(tmp_path / "one"), flight(tmp_path / "two", name=NASTY, frames=0)]
+    flights[1].track = None
     write_page(tmp_path / "page.html", flights)
     command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"]
     command += ["--disable-background-networking", "--disable-sync", "--enable-logging=stderr"]
