@@ -14,7 +14,7 @@ from torch import Tensor
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, STICK_TERMS, Contract
 from policy.nets.world_model.config import WorldModelConfig
@@ -106,7 +106,7 @@ class RolloutStart:
     """[context_frames, 13]"""
     newest_ns: int
     """Exposure of the newest frame, on the flight's clock."""
-    sent: tuple[tuple[int, Sticks | None], ...]
+    sent: tuple[tuple[int, Action | None], ...]
     """Sticks sent before ``newest_ns``, each with its time; None: released."""
 
 

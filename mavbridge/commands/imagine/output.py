@@ -8,7 +8,7 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from threading import Event
 
@@ -27,7 +27,6 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray
-from mavbridge.core.stopping import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video_file import WRITE_ERRORS
@@ -71,8 +70,6 @@ def writing(path: Path) -> Iterator[None]:
 QUEUED_SEGMENTS = 2
 """Most segments that wait for the decoder; the loop then waits, too, so that the slowest part sets
 the pace."""
-STALL_S = 120.0
-"""Longest time without a finished frame."""
 END_S = 45.0
 """Longer than the timeout for a hung writer process."""
 _POLL_S = 0.1
@@ -129,19 +126,12 @@ class StreamedOutput:
         self._open.append(self._thread.submit(self._serve, segment, ready))
 
     def _wait(self, most: int, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Wait until at most ``most`` segments are open, as long as frames are finished.
-
-        Waits are counted, not timed: a pause of the process (Ctrl-Z) is one of them.
-        """
-        seen, waits = self.frames, 0
+        """Wait until at most ``most`` segments are open."""
         while len(self._open) > most:
             on_wait()
             if wait([self._open[0]], _POLL_S).done:
                 self._open[0].result()  # raises the thread's exception, also at the next call
                 self._open.popleft()
-            seen, waits = self.frames, waits + 1 if self.frames == seen else 0
-            if waits * _POLL_S > STALL_S:
-                raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Write all segments, close the files, and compare their lengths."""
@@ -189,15 +179,13 @@ class StreamedOutput:
                     }
                 )
             self._table.flush()
-        missing = [row for row in range(plan.frames) if row not in segment.decoded]
-        images = self._decoded(segment.latents, missing, ready)
         for row in range(plan.frames):
             if self._stop.is_set():
                 return
             if self.video is not None:
                 rgb = segment.decoded.get(row)
                 if rgb is None:
-                    rgb = next(images)
+                    rgb = self._decode(segment.latents[row, None], ready)
                 number = segment.iteration * plan.frames + row
                 # Frames of the video are evenly spaced.
                 at_ns = round(number * self._frame_dt_s * NS_PER_S)
@@ -206,20 +194,14 @@ class StreamedOutput:
                 self._digest.update(np.ascontiguousarray(rgb).data)
             self.frames += 1
 
-    def _decoded(
-        self, latents: Tensor, rows: list[int], ready: torch.cuda.Event | None
-    ) -> Iterator[ImageArray]:
-        """Decode rows of latents [N, C, h, w], one at a time: the loop needs the processor, too.
-
-        On a GPU the latents can be read after the event ``ready``.
-        """
+    def _decode(self, latents: Tensor, ready: torch.cuda.Event | None) -> ImageArray:
+        """Decode latents [1, C, h, w]; on a GPU they can be read after the event ``ready``."""
+        beside: AbstractContextManager[object] = nullcontext()
         if self._stream is not None and ready is not None:
             self._stream.wait_event(ready)
             # Once the loop's stream frees the memory, it must not be reused before this one ends.
             latents.record_stream(self._stream)
-        for row in rows:
-            beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
-            with torch.inference_mode(), beside:
-                decoded = self._model.decode(latents[row, None])[0]
-                pixels: ImageArray = decoded.cpu().numpy()
-            yield pixels
+            beside = torch.cuda.stream(self._stream)
+        with torch.inference_mode(), beside:
+            pixels: ImageArray = self._model.decode(latents)[0].cpu().numpy()
+        return pixels

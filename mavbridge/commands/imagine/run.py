@@ -28,7 +28,6 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.simulation.clock import SteppedClock
@@ -77,7 +76,11 @@ def imagine(config: ImagineConfig) -> int:
         output = StreamedOutput(config.out, sampler, plan, decode_video=config.decode_video)
         stack.callback(output.close)
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
-    _print_summary(config, output)
+    lines = [f"{config.out}: {output.frames} frames", f"sha256 of the frames: {output.sha256}"]
+    if not config.decode_video:
+        lines = [f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"]
+    for line in lines:
+        text_console().print(line, soft_wrap=True)
     if was_stopped:
         console.print("interrupted: the files hold what was imagined so far", style="yellow")
     return INTERRUPTED if was_stopped else 0
@@ -129,22 +132,17 @@ def _make_decider(
     return PolicyDecider(loaded.runner, sampler, clock)
 
 
-def _print_summary(config: ImagineConfig, output: StreamedOutput) -> None:
-    lines = [f"{config.out}: {output.frames} frames", f"sha256 of the frames: {output.sha256}"]
-    if not config.decode_video:
-        lines = [f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"]
-    for line in lines:
-        text_console().print(line, soft_wrap=True)
-
-
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
     """Read the context from ``start_s`` after the first state; raise UserError, DatasetError."""
-    _require_same_kind(flight, config)
+    what, contract = f"--start {flight.folder}", flight.meta.contract
+    if contract.action != "sticks":
+        raise UserError(f"{what} was flown by {contract.action}, the world model takes sticks")
+    require_terms(config.contract, contract, what)
     captured_ns = flight.frames["captured_ns"].to_numpy()
     ticks = flight.ticks.filter(flight.ticks["state"].is_valid())
     if not (len(captured_ns) and ticks.num_rows):
         lacks = "no state of the vehicle" if len(captured_ns) else "no frames"
-        raise UserError(f"--start {flight.folder} holds {lacks}: name a flight that was flown")
+        raise UserError(f"{what} holds {lacks}: name a flight that was flown")
     state_ns = ticks["attitude_ns"].to_numpy()
     with_state = captured_ns[captured_ns >= state_ns[0]]
     first_ns = int(with_state[0] if len(with_state) else captured_ns[-1] + 1)
@@ -153,15 +151,15 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     wanted_ns = [first_ns + round(k * dt_s * NS_PER_S) for k in range(config.context_frames)]
     if wanted_ns[-1] > captured_ns[-1] + round(dt_s * NS_PER_S / 2):
         raise UserError(
-            f"--start {flight.folder} is too short: {config.context_frames} frames {dt_s:g} s "
+            f"{what} is too short: {config.context_frames} frames {dt_s:g} s "
             f"apart are needed from {start_s:g} s after its first state on, its frames end "
             f"{(captured_ns[-1] - first_ns) / NS_PER_S + start_s:.2f} s after it"
         )
-    frames = [_nearest(captured_ns, at_ns) for at_ns in wanted_ns]
+    frames = [int(np.abs(captured_ns - at_ns).argmin()) for at_ns in wanted_ns]
     off_s = np.abs(captured_ns[frames] - np.array(wanted_ns)) / NS_PER_S
     if off_s.max() >= dt_s / 2:  # otherwise no image is taken twice
         raise UserError(
-            f"--start {flight.folder} has no image within {dt_s / 2:g} s of "
+            f"{what} has no image within {dt_s / 2:g} s of "
             f"{start_s + off_s.argmax() * dt_s:.2f} s after its first state: choose another "
             "--start-at"
         )
@@ -171,31 +169,16 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
     for row, at_ns in zip(known, captured_ns[frames], strict=True):
         if (age_ns := at_ns - state_ns[row]) > MAX_STATE_AGE_NS:
             raise UserError(
-                f"--start {flight.folder}: at {(at_ns - state_ns[0]) / NS_PER_S:.2f} s its newest "
+                f"{what}: at {(at_ns - state_ns[0]) / NS_PER_S:.2f} s its newest "
                 f"state is {age_ns / NS_PER_MS:.0f} ms old (limit {MAX_STATE_AGE_NS // NS_PER_MS} "
                 "ms): choose another --start-at, or the flight of a faster policy"
             )
+    sent = [(row.tick.sent_ns, row.tick.sent) for row in flight.tick_rows()]
     return RolloutStart(
         images=_start_images(flight, frames, config.image_size),
         states=np.array(ticks["state"].take(known).to_pylist(), np.float32),
         newest_ns=newest_ns,
-        sent=_sent_before(flight, newest_ns),
-    )
-
-
-def _require_same_kind(flight: RecordedFlight, config: WorldModelConfig) -> None:
-    what, contract = f"--start {flight.folder}", flight.meta.contract
-    if contract.action != "sticks":
-        raise UserError(f"{what} was flown by {contract.action}, the world model takes sticks")
-    require_terms(config.contract, contract, what)
-
-
-def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks | None], ...]:
-    columns = (flight.ticks["sent_ns"].to_pylist(), flight.ticks["sent"].to_pylist())
-    return tuple(
-        (sent_ns, None if sent is None else Sticks(*sent))
-        for sent_ns, sent in zip(*columns, strict=True)
-        if sent_ns < now_ns
+        sent=tuple((at_ns, action) for at_ns, action in sent if at_ns < newest_ns),
     )
 
 
@@ -207,7 +190,3 @@ def _start_images(flight: RecordedFlight, frames: list[int], size: int) -> NDArr
         if index >= frames[-1]:
             break
     return np.stack([found[index] for index in frames])
-
-
-def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
-    return int(np.abs(stamps_ns - at_ns).argmin())
