@@ -11,7 +11,8 @@ from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import PolicyRunner
-from sitl.pilot.demonstrator import Expert, RateExpert
+from sitl.pilot.course_guide import CourseGuide
+from sitl.pilot.demonstrator import RATE_AGILITY, STICK_AGILITY, expert_rates, expert_sticks
 from sitl.pilot.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.looks import training_conditions
@@ -104,7 +105,7 @@ class Pilot:
             strengths=RATE_STRENGTHS if self._by_rates else STICK_STRENGTHS,
         )
         self._turns = TurnSchedule(variation.seed)
-        self._expert: Expert | RateExpert | None = None
+        self._guide: CourseGuide | None = None
         self._solves = 0
         self._planned: tuple[int, FloatArray] | None = None
         """Time and values of the student's chunk that flies."""
@@ -136,23 +137,23 @@ class Pilot:
             start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
             self._flight.vehicle.launch(start)
             self.begin_ns, next_gate = self.begin_ns + SETTLE_NS, start.next_gate
-        make = RateExpert if self._by_rates else Expert
-        self._expert = make(self._flight.course, self._speed_mps, next_gate=next_gate)
+        agility = RATE_AGILITY if self._by_rates else STICK_AGILITY
+        self._guide = CourseGuide(self._flight.course, agility, self._speed_mps, next_gate)
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
         horizon = self.runner.contract.horizon
-        if self._expert is None:  # not engaged yet: the guard has to see chunks first
+        if self._guide is None:  # not engaged yet: the guard has to see chunks first
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_ns, body = self._flight.clock.now_ns(), self._flight.vehicle.ap.truth
         now_s, solve_ns = now_ns / NS_PER_S, self._variation.delays.vision.offset_ns
         label: Action
         disturbed: Sequence[float]
-        if isinstance(self._expert, RateExpert):
-            command = self._expert.command(body, now_s)
+        if self._by_rates:
+            command = expert_rates(self._guide, body, now_s)
             label, disturbed = BodyRates(*command), self._disturbance.flown(command, now_s)
         else:
-            sticks = self._expert.sticks(body, now_s)
+            sticks = expert_sticks(self._guide, body, now_s)
             label, disturbed = Sticks(*sticks), self._disturbance.flown(sticks, now_s)
         self.expert_actions[self._solves] = label
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))

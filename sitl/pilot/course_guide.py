@@ -77,13 +77,16 @@ class Agility:
 class CourseGuide:
     """Guidance of one flight over a course; call `demand` at 50 Hz or more.
 
-    ``speed_mps`` is the speed where the course allows it.
+    ``speed_mps`` is the speed where the course allows it; at 8 m/s by sticks it slows down for
+    corners.
 
     Raises:
         UsageError: a speed that cannot be flown.
     """
 
-    def __init__(self, course: Course, agility: Agility, speed_mps: float, next_gate: int) -> None:
+    def __init__(
+        self, course: Course, agility: Agility, speed_mps: float, next_gate: int = 0
+    ) -> None:
         if not MIN_SPEED_MPS <= speed_mps <= agility.max_speed_mps:
             raise UsageError(
                 f"the expert flies at {MIN_SPEED_MPS} to {agility.max_speed_mps} m/s, "

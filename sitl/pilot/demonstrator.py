@@ -4,7 +4,6 @@ import cmath
 import math
 from typing import NamedTuple
 
-from sitl.course import Course
 from sitl.pilot.course_guide import Agility, CourseGuide, Demand, Predicted
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
@@ -140,52 +139,26 @@ RATE_AGILITY = Agility(
 )
 
 
-class Expert:
-    """Demonstrator of one flight by sticks; call `sticks` at 50 Hz or more.
+def expert_sticks(guide: CourseGuide, body: BodyState, t_s: float) -> StickPositions:
+    """Return the sticks for this state, by a guide of ``STICK_AGILITY``; call at 50 Hz or more.
 
-    ``speed_mps`` is its speed where the course allows it; at 8 m/s it slows down for corners.
-    It does not know the vehicle's parameters: it has the nominal vehicle's stick curves and lag.
-
-    Raises:
-        UsageError: a speed that it cannot fly at.
+    Positions of successive calls are the flown trajectory. The expert does not know the vehicle's
+    parameters: it has the nominal vehicle's stick curves and lag.
     """
-
-    def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
-        self._guide = CourseGuide(course, STICK_AGILITY, speed_mps, next_gate)
-
-    @property
-    def next_gate(self) -> int | None:
-        return self._guide.next_gate
-
-    def sticks(self, body: BodyState, t_s: float) -> StickPositions:
-        """Return the sticks for this state. Positions of successive calls are the flown
-        trajectory."""
-        north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
-        state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), STICK_LAG_S)
-        demand = self._guide.demand(body.position_ned_m, t_s, state)
-        return sticks_for(demand, complex(north_mps2, east_mps2), state.yaw_rad)
+    north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
+    state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), STICK_LAG_S)
+    demand = guide.demand(body.position_ned_m, t_s, state)
+    return sticks_for(demand, complex(north_mps2, east_mps2), state.yaw_rad)
 
 
-class RateExpert:
-    """Demonstrator of one flight by thrust and body rates; call `command` at 100 Hz or more.
-
-    Raises:
-        UsageError: a speed that it cannot fly at.
-    """
-
-    def __init__(self, course: Course, speed_mps: float, *, next_gate: int = 0) -> None:
-        self._guide = CourseGuide(course, RATE_AGILITY, speed_mps, next_gate)
-
-    @property
-    def next_gate(self) -> int | None:
-        return self._guide.next_gate
-
-    def command(self, body: BodyState, t_s: float) -> RateCommand:
-        ned_from_body = integrate(body.ned_from_body_wxyz, body.rate_body_radps, RATE_LAG_S)
-        north, east, down = rotate(body.ned_from_body_wxyz, body.specific_force_body_mps2)
-        state = _predict(body, (north, east, down + GRAVITY_MPS2), RATE_LAG_S)
-        demand = self._guide.demand(body.position_ned_m, t_s, state)
-        return rate_command(demand, state, ned_from_body, _drag_ned_mps2(body))
+def expert_rates(guide: CourseGuide, body: BodyState, t_s: float) -> RateCommand:
+    """Return thrust and rates for this state, by a guide of ``RATE_AGILITY``; call at 100 Hz or
+    more, with the positions of one trajectory."""
+    ned_from_body = integrate(body.ned_from_body_wxyz, body.rate_body_radps, RATE_LAG_S)
+    north, east, down = rotate(body.ned_from_body_wxyz, body.specific_force_body_mps2)
+    state = _predict(body, (north, east, down + GRAVITY_MPS2), RATE_LAG_S)
+    demand = guide.demand(body.position_ned_m, t_s, state)
+    return rate_command(demand, state, ned_from_body, _drag_ned_mps2(body))
 
 
 def _drag_ned_mps2(body: BodyState) -> Vec3:

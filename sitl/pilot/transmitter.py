@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple, Protocol, TypeAlias
 from sitl import UsageError
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
-from sitl.pilot.demonstrator import CENTRED, Expert, StickPositions
+from sitl.pilot.course_guide import CourseGuide
+from sitl.pilot.demonstrator import CENTRED, STICK_AGILITY, StickPositions, expert_sticks
 from sitl.simulated_vehicle import SimulatedVehicle
 
 OFF_US = (0,) * 8  # no signal from the transmitter
@@ -125,7 +126,7 @@ class ExpertPilot:
 
     def __init__(self, vehicle: SimulatedVehicle, course: Course, *, speed_mps: float) -> None:
         self._vehicle = vehicle
-        self._expert = Expert(course, speed_mps)
+        self._guide = CourseGuide(course, STICK_AGILITY, speed_mps)
         self._start_ns = vehicle.ap.now_ns
         self._transmitter = Transmitter(self._start_ns)
         self._phase: Literal["waiting", "flying", "landing", "over"] = "waiting"
@@ -157,8 +158,8 @@ class ExpertPilot:
         return "high" if self._over_course_ns is None else "low"
 
     def _fly(self, now_ns: int) -> StickPositions:
-        sticks = self._expert.sticks(self._vehicle.ap.truth, now_ns / NS_PER_S)
-        if self._expert.next_gate is None:
+        sticks = expert_sticks(self._guide, self._vehicle.ap.truth, now_ns / NS_PER_S)
+        if self._guide.next_gate is None:
             if self._over_course_ns is None:
                 self._over_course_ns = now_ns
             if now_ns - self._over_course_ns >= HOVER_NS:

@@ -7,7 +7,8 @@ from itertools import pairwise
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
-from sitl.pilot.demonstrator import Expert, StickPositions
+from sitl.pilot.course_guide import CourseGuide
+from sitl.pilot.demonstrator import STICK_AGILITY, StickPositions, expert_sticks
 from sitl.pilot.disturbance import Disturbance
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions
@@ -79,7 +80,7 @@ def fly_course(
     else:
         vehicle.launch(start)
     next_gate = start.next_gate if start else 0
-    expert = Expert(course, speed_mps, next_gate=next_gate)
+    guide = CourseGuide(course, STICK_AGILITY, speed_mps, next_gate)
     ticks: list[Tick] = []
     over_ns = None
     begin_ns = now_ns = vehicle.ap.now_ns
@@ -90,7 +91,7 @@ def fly_course(
             if now_ns >= over_ns:
                 break
         body, t_s = pose.body, now_ns / NS_PER_S
-        label = expert.sticks(body, t_s)
+        label = expert_sticks(guide, body, t_s)
         flown = disturbance.flown(label, t_s) if disturbance else label
         ticks.append(Tick(pose=pose, next_gate=next_gate, label=label, flown=flown))
         vehicle.ap.rc.override(pwm_us(flown), now_ns)

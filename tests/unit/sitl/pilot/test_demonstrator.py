@@ -8,7 +8,8 @@ from helpers.course_flights import fly_course
 from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
 from sitl.course import AirborneStart, gate_truth, make_course
-from sitl.pilot.demonstrator import Expert, RateExpert
+from sitl.pilot.course_guide import CourseGuide
+from sitl.pilot.demonstrator import RATE_AGILITY, STICK_AGILITY
 from sitl.pilot.disturbance import Disturbance
 from sitl.vehicle.conditions import random_conditions
 from sitl.vehicle.rotation import IDENTITY, from_euler
@@ -77,15 +78,15 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
 
 
 @pytest.mark.parametrize(
-    ("expert", "speed_mps", "most"),
+    ("agility", "speed_mps", "most"),
     [
-        *((Expert, speed_mps, "10.0") for speed_mps in (0.0, 20.0, math.nan)),
-        *((RateExpert, speed_mps, "14") for speed_mps in (1.0, 15.0)),
+        *((STICK_AGILITY, speed_mps, "10.0") for speed_mps in (0.0, 20.0, math.nan)),
+        *((RATE_AGILITY, speed_mps, "14") for speed_mps in (1.0, 15.0)),
     ],
 )
-def test_a_speed_it_cannot_fly_at_is_refused(expert, speed_mps, most):
+def test_a_speed_it_cannot_fly_at_is_refused(agility, speed_mps, most):
     with pytest.raises(UsageError, match=f"1.5 to {most}"):
-        expert(make_course(0), speed_mps)
+        CourseGuide(make_course(0), agility, speed_mps)
 
 
 def test_truth_by_hand():

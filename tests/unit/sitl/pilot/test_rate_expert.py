@@ -7,7 +7,8 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course import RACE_SEEDS, Course, make_course
-from sitl.pilot.demonstrator import HOVER_THRUST, RateCommand, RateExpert
+from sitl.pilot.course_guide import CourseGuide
+from sitl.pilot.demonstrator import HOVER_THRUST, RATE_AGILITY, RateCommand, expert_rates
 from sitl.pilot.disturbance import RATE_STRENGTHS, Disturbance, random_start
 from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST
@@ -24,19 +25,19 @@ READY = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
 
 def fly(
     course: Course,
-    expert: RateExpert,
+    guide: CourseGuide,
     ap: ArduCopter | Px4,
     send: Callable[[RateCommand], None],
     disturbance: Disturbance,
 ) -> FlightLog:
     log = FlightLog(ap.now_ns, course)
     if not ap.landed:
-        log.start_over(expert.next_gate or 0)
+        log.start_over(guide.next_gate or 0)
     due_ns = ap.now_ns
     while log.verdict(ap.now_ns) is None and ap.now_ns < 40 * NS_PER_S:
         if ap.now_ns >= due_ns:
             due_ns += TICK_NS
-            wanted = expert.command(ap.truth, ap.now_ns / NS_PER_S)
+            wanted = expert_rates(guide, ap.truth, ap.now_ns / NS_PER_S)
             send(disturbance.flown(wanted, ap.now_ns / NS_PER_S))
         ap.step()
         log.on_step(ap)
@@ -61,9 +62,9 @@ def test_it_flies_on_from_the_air_and_against_disturbances_on_ardupilot() -> Non
         setpoint = AttitudeSetpoint(None, flown[1:], flown.thrust * lean)
         ap.guided and ap.guided.follow_attitude(setpoint, ap.sensed, ap.now_ns)
 
-    expert = RateExpert(course, 9.0, next_gate=start.next_gate)
+    guide = CourseGuide(course, RATE_AGILITY, 9.0, start.next_gate)
     disturbance = Disturbance(5, from_ground=False, strengths=RATE_STRENGTHS)
-    log = fly(course, expert, ap, send, disturbance)
+    log = fly(course, guide, ap, send, disturbance)
     assert not log.crashed
     assert log.next_gate is None
 
@@ -82,6 +83,7 @@ def test_it_flies_a_race_on_px4_with_its_heavy_drag() -> None:
     ap.intended = Px4Mode.OFFBOARD
     ap.step()
     assert ap.arm(), ap.texts
-    log = fly(course, RateExpert(course, 8.0), ap, send, Disturbance(0, strength=0.0))
+    guide = CourseGuide(course, RATE_AGILITY, 8.0)
+    log = fly(course, guide, ap, send, Disturbance(0, strength=0.0))
     assert not log.crashed
     assert log.next_gate is None
