@@ -5,14 +5,15 @@ see them. This module knows nothing about MAVLink, sockets or the host's time.
 """
 
 import math
+from bisect import bisect_left
 from contextlib import suppress
 
 from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import (
+    DEBOUNCE_NS,
     GESTURE_NS,
-    ModeSwitch,
     RcEngine,
     Sticks,
     climb_rate_mps,
@@ -25,6 +26,8 @@ from sitl.vehicle.dynamics import QUAD
 from sitl.vehicle.firmware import STOPPED, Autopilot, Held, Severity
 from sitl.vehicle.rotation import cos_tilt
 
+HIGHEST_POSITION_US = (1230, 1360, 1490, 1620, 1749)
+"""Highest value of each of the mode switch's first five positions."""
 LOW_READS_TO_FAIL = 3
 GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz
 
@@ -120,7 +123,8 @@ class ArduCopter(Autopilot):
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
-        self._mode_switch = ModeSwitch()
+        self._mode_position: int | None = None  # of the switch on FLTMODE_CH
+        self._mode_switch = Held(DEBOUNCE_NS)
         self._gesture = Held(GESTURE_NS)
         self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
@@ -319,11 +323,17 @@ class ArduCopter(Autopilot):
                 self.disarm(force=False)
 
     def _read_mode_switch(self) -> None:
+        """Take the mode of a new position of the switch on FLTMODE_CH; the first changes none."""
         channel = self.params.integer("FLTMODE_CH")
-        if not 1 <= channel <= len(self.rc.channels_us):
+        pwm_us = self.rc.channels_us[channel - 1] if 1 <= channel <= len(self.rc.channels_us) else 0
+        if not 900 < pwm_us < 2200:
             return
-        position = self._mode_switch.update(self.rc.channels_us[channel - 1], self.now_ns)
-        if position is not None:
+        self._mode_switch.see(1 + bisect_left(HIGHEST_POSITION_US, pwm_us), self.now_ns)
+        position = self._mode_switch.take(self.now_ns)
+        if position in (0, self._mode_position):
+            return
+        before, self._mode_position = self._mode_position, position
+        if before is not None:
             with suppress(ValueError):  # ignore a mode that this vehicle lacks
                 self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))
 

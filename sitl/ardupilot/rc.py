@@ -5,7 +5,6 @@ Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_thr
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -148,27 +147,6 @@ class RcEngine:
             self._takes_overrides = side > 0
         if side < 0:
             self.clear_overrides()
-
-
-class ModeSwitch:
-    """Switch on FLTMODE_CH, debounced: a new position acts after 0.2 s."""
-
-    _HIGHEST_US = (1230, 1360, 1490, 1620, 1749)  # of the first five positions
-
-    def __init__(self) -> None:
-        self.position: int | None = None
-        self._held = Held(DEBOUNCE_NS)
-
-    def update(self, pwm_us: int, now_ns: int) -> int | None:
-        """Return the position, 1..6, when it has just changed; None otherwise and for the first."""
-        if not 900 < pwm_us < 2200:
-            return None
-        self._held.see(1 + bisect_left(self._HIGHEST_US, pwm_us), now_ns)
-        position = self._held.take(now_ns)
-        if position in (0, self.position):
-            return None
-        before, self.position = self.position, position
-        return None if before is None else position
 
 
 THROTTLE_FULL = 1000.0
