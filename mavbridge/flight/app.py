@@ -17,13 +17,13 @@ from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
+from mavbridge.core.observers import FanOut
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle_thread
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Camera, FlightOutcome, TickSink
 from mavbridge.core.stopping import HungError, StopRequest, Worker, stop_on_signals
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, output_folders, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess, start_guard
@@ -31,8 +31,11 @@ from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy, looks_at_images
+from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.speed import require_speed
 from mavbridge.flight.state import observation_ages_ns
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.flight.vision_loop import vision_loops
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import patient_console
@@ -162,27 +165,34 @@ class _Flight:
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
         cameras = [
-            CameraPath(
-                camera=self._open_camera(source, contract, console),
-                cache=FeatureCache(span_ns=past_ns),
-                clock=clock,
-            )
+            self._open_camera(source, contract, console)
             for source in config.camera.sources_of(contract.cameras)
         ]
+        caches = [FeatureCache(span_ns=past_ns) for _ in cameras]
         self._observers.open_viewer(stack)
-        self._observers.open_recorder(guard, lambda: self._bridge.view.status.autopilot)
-        self._bridge: Bridge = build_bridge(
+        self._observers.open_recorder(guard, lambda: self._view.status.autopilot)
+        sink = FanOut((*self._observers.sinks, *sinks))
+        self._view = TelemetryCache(
+            plan, sink=sink, samples=guard.samples, watch_packets=self._observers.watch_packets
+        )
+        self._visions = vision_loops(
+            plan,
+            self._view,
+            encode=runner.encode,
+            cameras=cameras,
+            caches=caches,
+            clocks=[clock] * len(cameras),
+            sinks=[sink, *[FanOut(self._observers.recorders)] * (len(cameras) - 1)],
+            watches_images=looks_at_images(config),
+        )
+        self._policy = PolicyLoop(
             plan,
             runner,
             clock=clock,
-            send=self._guard.send,
-            cameras=cameras,
-            sinks=(*self._observers.sinks, *sinks),
-            watches_images=looks_at_images(config),
-            all_cameras=self._observers.recorders,
-            watch_solve=self._observers.watch_solve,
-            watch_packets=self._observers.watch_packets,
-            samples=self._guard.samples,
+            view=self._view,
+            caches=caches,
+            send=guard.send,
+            watch=self._observers.watch_solve,
         )
 
     def _close_recorder(self) -> None:
@@ -199,7 +209,7 @@ class _Flight:
             end = summary.outcome.end or end
         elif referee.reason not in (None, asked.reason):  # the guard died after the flight
             end = referee.end
-        status, is_current = self._bridge.view.status, summary is not None
+        status, is_current = self._view.status, summary is not None
         return referee.outcome(end, status, asked.reason, is_current=is_current)
 
     def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
@@ -219,17 +229,17 @@ class _Flight:
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""
-        bridge, screen = self._bridge, self._observers.screen
+        view, screen = self._view, self._observers.screen
         visions = [
             Worker(
                 "mavbridge-vision" if number == 0 else f"mavbridge-vision-{self._cameras[number]}",
                 vision.run,
             )
-            for number, vision in enumerate(bridge.visions)
+            for number, vision in enumerate(self._visions)
         ]
-        policy = Worker("mavbridge-policy", self._scheduled(bridge.policy.run))
+        policy = Worker("mavbridge-policy", self._scheduled(self._policy.run))
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
-        listen = self._scheduled(partial(self._guard.listen, view=bridge.view))
+        listen = self._scheduled(partial(self._guard.listen, view=view))
         listener = Worker("mavbridge-guard", listen)
         settle_process()
         # Joined in reverse: the guard has ended before anything that feeds it is closed.
@@ -251,7 +261,7 @@ class _Flight:
                 ending = over
                 break
             stop.wait(1 / STATUS_HZ)
-            released = released + 1 if bridge.view.phase is Phase.RELEASED else 0
+            released = released + 1 if view.phase is Phase.RELEASED else 0
             if released == 2 and not has_act:  # seen twice: it does not end by itself
                 where = "here (no terminal, no --engage-channel)"
                 screen.show_message(f"nothing can engage again {where}: end with Ctrl-C or SIGTERM")
@@ -279,14 +289,14 @@ class _Flight:
     @property
     def has_flown(self) -> bool:
         """True if the policy has had control."""
-        return bool(self._bridge.view.flights)
+        return bool(self._view.flights)
 
     def verdict(self, stop: StopRequest) -> int:
         """Return the exit status of the ended flight, and tell the user why it is not 0."""
         exit_code, text = flight_verdict(
             self._guard.summary,
             stop,
-            reason=self._bridge.view.reason,
+            reason=self._view.reason,
             readonly=self._config.link.readonly,
             crash=self._observers.referee.crash,
             record=self._config.record,
@@ -308,13 +318,13 @@ class _Flight:
         self._looked_ns = now_ns
         # Encoders wait for one another: the one that computes is the one that hangs.
         camera, _ = min(
-            zip(self._cameras, self._bridge.visions, strict=True),
+            zip(self._cameras, self._visions, strict=True),
             key=lambda encoder: (encoder[1].encoding_since_ns or now_ns, encoder[1].alive_ns),
         )
-        silent_ns = min(vision.alive_ns for vision in self._bridge.visions)
+        silent_ns = min(vision.alive_ns for vision in self._visions)
         encoder = f"encoder{self._named(camera, 'of camera ')}"
         watched = (
-            (self._bridge.policy.alive_ns, "policy", self._hang_ns),
+            (self._policy.alive_ns, "policy", self._hang_ns),
             (silent_ns, encoder, self._encoder_hang_ns),
         )
         for alive_ns, name, limit_ns in watched:
@@ -332,7 +342,7 @@ class _Flight:
         """Ask the guard to end, and wait while it holds the vehicle."""
         self._ending = ending
         self._guard.send(ending)
-        screen, view = self._observers.screen, self._bridge.view
+        screen, view = self._observers.screen, self._view
         asked = stop.requests
         until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
         is_told = False
@@ -360,7 +370,7 @@ class _Flight:
 
     def finish(self) -> None:
         """Print the report of a flight with a vehicle, and write it to --report."""
-        view, screen, summary = self._bridge.view, self._observers.screen, self._guard.summary
+        view, screen, summary = self._view, self._observers.screen, self._guard.summary
         for text in view.take_texts():  # said after the last tick
             screen.show_message(text)
         if view.status.armed and not view.status.is_landed and view.flights:

@@ -1,10 +1,10 @@
 """Slow path: encode the newest frame into the feature cache, in its own thread."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from mavbridge.camera.image_watch import ImageWatch
-from mavbridge.core.clock import NS_PER_MS, Clock
+from mavbridge.core.clock import NS_PER_MS, Clock, period_ns
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import (
     Camera,
@@ -15,6 +15,8 @@ from mavbridge.core.records import (
     VisionTick,
 )
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from policy.errors import NoChunkError
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
@@ -153,3 +155,42 @@ class VisionLoop:
         # Keep the grid through jitter; after a gap start a new one.
         self._used_ns = max(due_ns, captured_ns - self._period_ns // 2)
         return True
+
+
+def vision_loops(
+    plan: FlightPlan,
+    view: TelemetryCache,
+    *,
+    encode: Callable[[CameraImage, int], FloatArray],
+    cameras: Sequence[Camera],
+    caches: Sequence[FeatureCache],
+    clocks: Sequence[Clock],
+    sinks: Sequence[TickSink],
+    watches_images: bool,
+) -> tuple[VisionLoop, ...]:
+    """Return the loop of each camera of a policy, in the contract's order.
+
+    ``encode`` is ``PolicyRunner.encode``, in turns of the loops.
+    ``watches_images``: a frozen or a black image is a fault; False where nobody looks at it.
+    """
+    config, encoder_lock = plan.config.camera, threading.Lock()
+    parts = zip(cameras, caches, clocks, sinks, plan.image_rates_hz, strict=True)
+    return tuple(
+        VisionLoop(
+            camera=camera,
+            encode=encode,
+            cache=cache,
+            sink=sink,
+            clock=clock,
+            period_ns=period_ns(rate_hz),
+            encoder_lock=encoder_lock,
+            image_watch=ImageWatch(
+                max_frozen_s=config.max_frozen_image, max_black_s=config.max_black_image
+            )
+            if watches_images
+            else None,
+            is_airborne=lambda: view.is_airborne,
+            number=number,
+        )
+        for number, (camera, cache, clock, sink, rate_hz) in enumerate(parts)
+    )

@@ -9,12 +9,15 @@ import numpy as np
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
+from mavbridge.core.observers import FanOut
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import CameraImage, TickSink
-from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.settings import link_settings
 from mavbridge.flight.state import observation_ages_ns
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.flight.vision_loop import vision_loops
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.link import MavlinkLink
@@ -187,27 +190,27 @@ class SimulatedFlight:
         send = sender(world, policy_clock, flight_port)
         send(plan.guard)
         past_ns = observation_ages_ns(contract)[0]
-        bridge = build_bridge(
+        caches = [DelayedFeatureCache(world, span_ns=past_ns) for _ in cameras]
+        runner = self._take_time(runner, vision_clocks, policy_clock)
+        view = TelemetryCache(plan, sink=FanOut(sinks))
+        visions = vision_loops(
             plan,
-            self._take_time(runner, vision_clocks, policy_clock),
-            clock=policy_clock,
-            send=send,
-            cameras=[
-                CameraPath(
-                    camera=camera, cache=DelayedFeatureCache(world, span_ns=past_ns), clock=clock
-                )
-                for camera, clock in zip(cameras, vision_clocks, strict=True)
+            view,
+            encode=runner.encode,
+            cameras=cameras,
+            caches=caches,
+            clocks=vision_clocks,
+            sinks=[
+                DelayedSink(world, FanOut(() if number else sinks))
+                for number in range(len(cameras))
             ],
-            sinks=sinks,
             watches_images=self._settings.draw_images,
-            delay_vision=lambda sink: DelayedSink(world, sink),
         )
-        for clock, camera, vision in zip(vision_clocks, cameras, bridge.visions, strict=True):
+        policy = PolicyLoop(plan, runner, clock=policy_clock, view=view, caches=caches, send=send)
+        for clock, camera, vision in zip(vision_clocks, cameras, visions, strict=True):
             stepper = Stepper(world, clock, camera.has_frame, vision.step)
             camera.arrival_watchers.append(stepper.run)
-        to_flight.on_arrival = flight_process(
-            world, policy_clock, flight_port, bridge.policy, bridge.view
-        )
+        to_flight.on_arrival = flight_process(world, policy_clock, flight_port, policy, view)
         guard_stepper = GuardStepper(world, guard)
         to_guard.on_arrival = self._downlink.on_arrival = guard_stepper.step
         return guard

@@ -15,16 +15,17 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import ListSink
 from helpers.guard_facts import codes
-from helpers.guard_world import Direction, FlightPort, FreshFeatures, Network, NoCamera
+from helpers.guard_world import Direction, FlightPort, FreshFeatures, Network
 from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import Sticks
-from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.settings import link_settings
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, LastWords, ToGuard, encode_to_guard
@@ -131,21 +132,18 @@ class GuardFlight:
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
         plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
-        bridge = build_bridge(
+        self.view = TelemetryCache(plan, sink=self.sink)
+        policy = PolicyLoop(
             plan,
             runner,
             clock=self._policy_clock,
+            view=self.view,
+            caches=[self.features],
             send=self._send,
-            cameras=[CameraPath(camera=NoCamera(), cache=self.features, clock=self.clock)],
-            sinks=[self.sink],
-            watch_solve=self.solves.append,
-            watches_images=False,
+            watch=self.solves.append,
         )
-        self.view = bridge.view
         self.tell(plan.guard)
-        receive = flight_process(
-            self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
-        )
+        receive = flight_process(self.clock, self._policy_clock, self._port, policy, self.view)
         stepper = GuardStepper(self.clock, self.guard)
         to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else receive()
         to_guard.on_arrival = self.down.on_arrival = stepper.step

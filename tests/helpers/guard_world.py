@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import FeatureFrame, Frame
+from mavbridge.core.records import FeatureFrame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.guard.wire import FromGuard, decode_from_guard
 from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
@@ -114,15 +114,3 @@ class FreshFeatures(FeatureCache):
             ready_ns=captured_ns,
             value=np.zeros((1, 1), np.float32),
         )
-
-
-class NoCamera:
-    """Never read, because the features come from ``FreshFeatures``."""
-
-    dropped_frames = 0
-
-    def read(self, timeout_ns: int) -> Frame | None:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        raise NotImplementedError

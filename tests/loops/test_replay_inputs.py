@@ -14,10 +14,11 @@ from helpers.output_flights import HOVERING, OutputFlight
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
+from mavbridge.core.records import FeatureFrame, Solve, Tick, TickSink, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.flight.policy_loop import chunk_of
+from mavbridge.flight.policy_loop import PolicyLoop, chunk_of
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.values import Phase
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation import flight as simulation
@@ -137,18 +138,19 @@ def flown_and_paired(
     autopilot: AutopilotName = "ardupilot",
 ) -> list[SolvePair]:
     """A short flight, and every solve of it once more, by the other policy."""
-    flown, compose = Flown(), simulation.build_bridge
+    flown, loops = Flown(), simulation.vision_loops
 
-    def recorded(*arguments: Any, **named: Any) -> Any:
-        return compose(
-            *arguments,
-            **named,
-            all_cameras=[flown.sink],
-            watch_solve=flown.solves.append,
-            watch_packets=flown.packets.extend,
-        )
+    def recorded(*arguments: Any, sinks: list[TickSink], **named: Any) -> Any:
+        others = [flown.sink] * len(sinks[1:])
+        return loops(*arguments, sinks=[*sinks[:1], *others], **named)
 
-    monkeypatch.setattr(simulation, "build_bridge", recorded)
+    parts = {
+        "vision_loops": recorded,
+        "PolicyLoop": partial(PolicyLoop, watch=flown.solves.append),
+        "TelemetryCache": partial(TelemetryCache, watch_packets=flown.packets.extend),
+    }
+    for name, part in parts.items():
+        monkeypatch.setattr(simulation, name, part)
     monkeypatch.setattr(simulation, "MavlinkLink", partial(MavlinkLink, keeps_packets=True))
     settings = SimulationSettings(config=FlyConfig(goal=goal), least_camera_px=32)
     vehicle = make_vehicle(autopilot=autopilot)

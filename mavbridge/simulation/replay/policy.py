@@ -1,10 +1,10 @@
 """Replay of a flight's policy loop with the recorded bytes, features and sent sticks.
 
 ``TelemetryCache``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run
-as in the flight, composed by ``build_bridge``. The recording supplies the start and end of each
-solve, the arrival and measurement times of packets, and the sent sticks. A solve's state, stamps
-and newest image show which messages had reached the flight process. Solves that returned no chunk
-are not recorded and not repeated.
+as in the flight. The recording supplies the start and end of each solve, the arrival and
+measurement times of packets, and the sent sticks. A solve's state, stamps and newest image show
+which messages had reached the flight process. Solves that returned no chunk are not recorded and
+not repeated.
 
 A policy with the recorded contract gets the recorded states and history, any other policy those
 rebuilt here. Both are compared.
@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mavbridge.camera.open import BlankCamera
+from mavbridge.core.observers import FanOut
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
-from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.state import StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
@@ -87,19 +87,16 @@ class _Loop:
         span_ns = observation_ages_ns(runner.contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
         plan = plan_flight(source.config, runner.contract, is_dual=runner.dual_rate)
-        unread = BlankCamera(image_size=(1, 1), clock=clock)  # the features are recorded
-        bridge = build_bridge(
+        self.view = TelemetryCache(plan, sink=FanOut(()))
+        self._policy = PolicyLoop(
             plan,
             replace(runner, act=self._timed_act),
             clock=clock,
+            view=self.view,
+            caches=self.caches,
             send=self._sent,
-            cameras=[CameraPath(camera=unread, cache=c, clock=clock) for c in self.caches],
-            sinks=(),
-            watches_images=False,
-            watch_solve=self._keep,
+            watch=self._keep,
         )
-        self._policy = bridge.policy
-        self.view = bridge.view
         autopilot = source.meta.autopilot or "none"
         self.view.receive(GuardStatus(autopilot, None, True, None, (), None, has_position=True))
 
