@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.reasons import Reason
-from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd, Sticks
+from mavbridge.core.ticks import GuardTick
+from mavbridge.core.vehicle import FlightEnd, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
 ImageArray: TypeAlias = NDArray[np.uint8]
@@ -79,49 +80,28 @@ class Position(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tick:
-    """One step of the guard, with everything that explains it afterwards."""
+class Tick(GuardTick):
+    """One step of the guard, with everything that explains it afterwards.
+
+    Missed slots count if the policy had control at this tick and at the last one.
+    """
 
     serial: int
     """Number among all ticks of the flight. A gap is a tick that the observer dropped."""
-    index: int
-    due_ns: int
-    woke_ns: int
-    missed_slots: int
-    """Missed slots of the stick grid since the last tick, if the policy had control at both
-    ticks."""
     predict_ns: int | None
     """Duration of the policy's solve; None if no chunk was flown."""
-    sent_ns: int
-    """Time at which the datagram had been handed to the kernel."""
     feature_frame_id: int | None
     feature_captured_ns: int | None
     state: VehicleState | None
-    trace: ActionTrace | None
-    sent: Action | None
-    """The action as sent, rounded by the message; None if released, read-only or refused."""
-    release_reason: Reason | None
-    """Why the policy does not fly; None while it does, or if the guard has not said why."""
     mode: str | None
     armed: bool
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     texts: tuple[str, ...] = ()
-    is_slot: bool = True
-    """True: sent in a slot of the stick grid. False: sent between two slots, for a new chunk."""
-    chunk_serial: int | None = None
-    """Number of the chunk that was flown; None if none was."""
     chunk_computed_ns: int | None = None
     """End of the solve that made the chunk."""
-    is_coasting: bool = False
-    """True if the chunk was stale and flown only for the grace period."""
-    phase: str | None = None
-    """Value of ``guard.engagement.Phase``; None in old records."""
     position_ned_m: Position | None = None
     """Position from the estimator's origin; None if the vehicle reports none or a stale one."""
-    decided_ns: int | None = None
-    """Time for which the action was computed: the slot, or the arrival of a chunk between two
-    slots. None in old records."""
     readonly: bool = False
     """True if the flight sends no action; in a recording, if no tick has one."""
 

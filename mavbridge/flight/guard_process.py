@@ -13,6 +13,7 @@ from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
+from mavbridge.core.ticks import GuardTick
 from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
@@ -22,7 +23,6 @@ from mavbridge.guard.wire import (
     FromGuard,
     GuardError,
     GuardSummary,
-    GuardTick,
     LastWords,
     ToGuard,
     decode_from_guard,
@@ -203,7 +203,7 @@ class GuardProcess:
         died_ns, words, newest = self._clock.now_ns(), self._words, self._newest
         if words is None or newest is None or not words.packets:
             return "it held no sticks"
-        if newest.phase is not words.phase and newest.phase not in _STILL_OURS:
+        if newest.phase not in (words.phase, *_STILL_OURS):
             return "it had released the sticks"
         if not self.wait(REAP_S):
             return f"it does not exit, so nothing was sent in its place; {OWN_TIMEOUT}"

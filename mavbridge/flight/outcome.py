@@ -53,7 +53,7 @@ class Standstill:
         speed_mps = math.nan if tick.state is None else tick.state.speed_mps
         self._has_moved = self._has_moved or speed_mps > MOVED_MPS
         is_still = self._has_moved and speed_mps < STILL_MPS
-        if tick.phase != Phase.FLYING.value or not is_still:
+        if tick.phase != Phase.FLYING or not is_still:
             self._since_ns = None
         elif self._since_ns is None:
             self._since_ns = tick.sent_ns
@@ -88,7 +88,7 @@ class FlightReferee:
             return
         if self._standstill is not None:
             self._standstill.see(event)
-        was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING.value
+        was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING
         if self._is_flying:
             self._began_ns = self._began_ns or event.sent_ns
             self._flown, self.reason = event, None

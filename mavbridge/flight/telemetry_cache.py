@@ -5,11 +5,13 @@ import select
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
+from dataclasses import fields
 from itertools import groupby
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Position, Solve, Tick, TickSink, VehicleState
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory
@@ -22,7 +24,6 @@ from mavbridge.guard.wire import (
     GuardError,
     GuardStatus,
     GuardSummary,
-    GuardTick,
     LastWords,
     Packets,
     Samples,
@@ -36,6 +37,7 @@ MAX_PAST = 4096
 """Attitudes queued for the next solve: ten seconds of the fastest stream."""
 MAX_SOLVES = 256
 """Chunks whose inputs are kept until the guard reports that it has flown them."""
+_REPORTED = tuple(field.name for field in fields(GuardTick))
 
 
 class TelemetryCache:
@@ -182,9 +184,9 @@ class TelemetryCache:
             if self._samples is not None and not self._is_awaited:
                 for data in self._samples.receive():  # a slow policy leaves them to us
                     self._receive_samples(decode_samples(data))
-        if tick.phase is Phase.FLYING and self.phase is not Phase.FLYING:
+        before, self.phase, self.reason = self.phase, Phase(tick.phase), tick.release_reason
+        if self.phase is Phase.FLYING and before is not Phase.FLYING:
             self.flights += 1
-        self.phase, self.reason = tick.phase, tick.reason
         self.starting_ns = tick.starting_ns
         joined = self._join(tick)
         if not joined.is_refused:  # else the vehicle still flies the last action
@@ -200,32 +202,21 @@ class TelemetryCache:
         state = solve.state if solve else self.reader.motion(self.telemetry, sent.sent_ns)
         position = self.telemetry.position_ned_m
         is_placed = position is not None and sent.sent_ns - position.arrived_ns <= POSITION_NS
-        texts = self.take_texts()
-        is_flown = sent.phase is Phase.FLYING
+        reported = {name: getattr(sent, name) for name in _REPORTED}
+        if not (self._was_flown and sent.trace):
+            reported["missed_slots"] = 0
         return Tick(
+            **reported,
             serial=self._serial,
-            index=-1 if sent.slot is None else sent.slot,
-            due_ns=sent.due_ns,
-            woke_ns=sent.woke_ns,
-            decided_ns=sent.decided_ns,
-            missed_slots=sent.missed_slots if self._was_flown and sent.trace else 0,
             predict_ns=solve.computed_ns - solve.started_ns if solve else None,
-            sent_ns=sent.sent_ns,
             feature_frame_id=solve.frame_ids[-1][0] if solve else None,
             feature_captured_ns=captured_ns,
             state=state if isinstance(state, VehicleState) else None,
-            trace=sent.trace,
-            sent=sent.sent,
-            release_reason=None if is_flown else sent.reason,
             mode=self.status.mode,
             armed=self.status.armed,
             rc_channels_us=self.status.rc_channels_us,
             rc_sticks=self.status.rc_sticks,
-            texts=texts,
-            is_slot=sent.slot is not None,
-            chunk_serial=sent.chunk_serial,
-            is_coasting=sent.is_coasting,
-            phase=sent.phase.value,
+            texts=self.take_texts(),
             chunk_computed_ns=solve.computed_ns if solve else None,
             position_ned_m=Position(*position.values) if position and is_placed else None,
             readonly=self._readonly,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
     Action,
     ActionTrace,
@@ -36,7 +37,6 @@ from mavbridge.guard.values import (
     Phase,
     StickGrid,
 )
-from mavbridge.guard.wire import GuardTick
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells the position of the pilot's sticks."""
@@ -169,7 +169,8 @@ class Guard:
             decision, trace = self._decide(actions.control, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
         tick = GuardTick(
-            slot=slot.index if slot else None,
+            index=slot.index if slot else -1,
+            is_slot=slot is not None,
             due_ns=slot.due_ns if slot else now_ns,
             woke_ns=now_ns,
             decided_ns=now_ns,
@@ -180,7 +181,7 @@ class Guard:
             trace=trace,
             sent=None,
             phase=phase,
-            reason=self._engagement.reason,
+            release_reason=self._engagement.reason,
             starting_ns=self._engagement.starting_ns or 0,
         )
         return GuardOutput(

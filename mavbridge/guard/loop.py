@@ -4,7 +4,7 @@ import select
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
     Command,
     LinkArrivals,
@@ -26,7 +27,6 @@ from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 from mavbridge.guard.wire import (
     GuardStatus,
-    GuardTick,
     LastWords,
     Packets,
     decode_to_guard,
@@ -141,7 +141,7 @@ class GuardLoop:
         if status is not None:
             basis += (status.mode, status.armed, status.is_landed, status.has_receiver)
             basis += (status.is_position_valid,)
-        is_old = tick.slot is not None and now_ns >= self._words_due_ns
+        is_old = tick.is_slot and now_ns >= self._words_due_ns
         if basis != self._words_basis or is_old:
             is_thrust = status is not None and status.mode in snapshot.modes.thrust
             self._words_due_ns = now_ns + (THRUST_WORDS_NS if is_thrust else WORDS_NS)
@@ -213,17 +213,17 @@ class GuardLoop:
         if isinstance(wanted, Command) and sent is None:
             self._guard.unsent()
         tick = output.tick
-        is_slot = tick.slot is not None
-        if is_slot or output.decision is not None or tick.phase is not self._phase:
-            due_ns, sent_ns = tick.due_ns if is_slot else woke_ns, self._clock.now_ns()
-            tick = tick._replace(due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
+        phase = self._guard.phase
+        if tick.is_slot or output.decision is not None or phase is not self._phase:
+            due_ns, sent_ns = tick.due_ns if tick.is_slot else woke_ns, self._clock.now_ns()
+            tick = replace(tick, due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
             self._flight.send(encode_from_guard(tick))
         self._follow(output)
-        if tick.phase is not self._phase:
-            self._change_phase(tick)
+        if phase is not self._phase:
+            self._change_phase(phase, tick.release_reason)
         self._link.service()
         self._renew_words(snapshot, tick)
-        if tick.phase is Phase.ENDED:
+        if phase is Phase.ENDED:
             self._finish(woke_ns)
         # After a failed command the next pass follows at once.
         return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
@@ -362,20 +362,20 @@ class GuardLoop:
             command_fault=self._command_fault,
         )
 
-    def _change_phase(self, tick: GuardTick) -> None:
+    def _change_phase(self, phase: Phase, reason: Reason | None) -> None:
         """Announce on the link who has control."""
-        before, self._phase = self._phase, tick.phase
+        before, self._phase = self._phase, phase
         self._link.is_engaged = self._phase in _ENGAGED
         text: str | None = None
         match self._phase:
             case Phase.FLYING:
                 text = "the policy has control"
             case Phase.LEAVING:
-                text = f"neutral: {tick.reason}"
+                text = f"neutral: {reason}"
             case Phase.HOLDING if self._guard is not None:
                 text = f"neutral sticks go on until {self._guard.ways_out}"
                 self._flight.send(encode_from_guard(text))
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
-                text = f"control given back: {tick.reason}"
+                text = f"control given back: {reason}"
         if text is not None:
             self._link.announce(f"mavbridge: {text}")

@@ -1,7 +1,7 @@
 """Inputs and outputs of the engagement."""
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, StrEnum
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.reasons import Reason
@@ -15,7 +15,7 @@ NOT_FOUND = VehicleStatus(mode="unknown", armed=False)
 """Status before a vehicle has been found."""
 
 
-class Phase(Enum):
+class Phase(StrEnum):
     """State of the engagement."""
 
     WAITING = "waiting"

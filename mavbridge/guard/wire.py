@@ -16,10 +16,9 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.reasons import Reason
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
-    Action,
-    ActionTrace,
     ForwardedPacket,
     LinkStats,
     Reading,
@@ -43,31 +42,6 @@ _MALFORMED = (
     *(ValueError, TypeError, LookupError, AttributeError),
 )
 """Errors of the decoders on malformed bytes."""
-
-
-class GuardTick(NamedTuple):
-    """One send of the guard, or one slot without anything to send."""
-
-    slot: int | None
-    """Number of the slot on the stick grid; None between slots."""
-    due_ns: int
-    woke_ns: int
-    decided_ns: int
-    """Time for which the sticks were computed: the slot, or the step between slots."""
-    sent_ns: int
-    """Time after the sticks were handed to the kernel."""
-    missed_slots: int
-    is_coasting: bool
-    chunk_serial: int | None
-    trace: ActionTrace | None
-    sent: Action | None
-    """Action as sent; None for a release, or if nothing was sent."""
-    phase: Phase
-    reason: Reason | None
-    """Why the policy does not fly; None while it does."""
-    starting_ns: int = 0
-    """Time since which only the policy's first chunk is missing: it gets control with the first
-    chunk that follows a reset at or after this time; 0: not starting."""
 
 
 class Samples(NamedTuple):

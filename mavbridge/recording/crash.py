@@ -39,7 +39,7 @@ class CrashWatch:
     def see(self, tick: Tick) -> None:
         """Process one tick."""
         if tick.armed:  # the guard releases in the pass in which it sees a disarming
-            is_ours = tick.phase in (None, "flying", "leaving")
+            is_ours = tick.phase in ("flying", "leaving")
             self._counts_falls = is_ours or tick.release_reason == _PILOTS
         was_armed, self._was_armed = self._was_armed, tick.armed
         if was_armed and not tick.armed:

@@ -21,10 +21,10 @@ from helpers.output_flights import OutputFlight
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import ActionKind
 from mavbridge.guard.memory import ACT_TIMEOUT_NS
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardTick
 from mavbridge.mavlink.transport.connection import Address, Received
 from mavbridge.simulation.network import VEHICLE
 from sitl.vehicle.config import AutopilotName

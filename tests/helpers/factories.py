@@ -14,10 +14,10 @@ from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Solve, Tick, VehicleState, VisionTick
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardTick
 from policy.contract import Contract
 
 START_NS = 1_000 * NS_PER_S
@@ -76,6 +76,7 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
         armed=True,
         rc_channels_us=(1500,) * 8,
         rc_sticks=NEUTRAL,
+        phase="flying",
         chunk_serial=index,
         chunk_computed_ns=changes.get("woke_ns", due_ns) + 2 * NS_PER_MS,
     )
@@ -89,6 +90,7 @@ def make_released_tick(index: int = 0, reason: Reason = _NO_IMAGE, **changes: An
         "trace": None,
         "sent": None,
         "release_reason": reason,
+        "phase": "released",
         "chunk_serial": None,
         "chunk_computed_ns": None,
     }
@@ -141,17 +143,15 @@ def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def make_guard_tick(at_ns: int, **changes: Any) -> GuardTick:
     """Return a slot that the guard served in time, with nothing to send."""
     tick = GuardTick(
-        slot=0,
+        index=0,
         due_ns=at_ns,
         woke_ns=at_ns,
         decided_ns=at_ns,
         sent_ns=at_ns,
         missed_slots=0,
-        is_coasting=False,
-        chunk_serial=None,
         trace=None,
         sent=None,
         phase=Phase.WAITING,
-        reason=None,
+        release_reason=None,
     )
-    return tick._replace(**changes)
+    return replace(tick, **changes)

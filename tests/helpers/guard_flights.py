@@ -21,6 +21,7 @@ from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Solve
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policy_loop import PolicyLoop
@@ -28,7 +29,7 @@ from mavbridge.flight.settings import link_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
-from mavbridge.guard.wire import GuardTick, LastWords, ToGuard, encode_to_guard
+from mavbridge.guard.wire import LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
@@ -299,7 +300,7 @@ class GuardFlight:
 
     @property
     def reason(self) -> Reason | None:
-        return self.last.reason if self.last else None
+        return self.last.release_reason if self.last else None
 
     @property
     def codes(self) -> tuple[Code, ...]:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import Solve, Tick
+from mavbridge.core.records import Solve
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import Action, ActionTrace
-from mavbridge.guard.wire import GuardTick
 from mavbridge.recording.rows import STATE_STAMPS, attributes
 from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
@@ -175,14 +175,14 @@ def _other_results(step: GuardStep) -> list[str]:
     if other is None:
         is_told = one.trace is not None or one.sent is not None or one.is_slot
         return ["ticks"] if is_told else []
-    return _differing(_results(one, one.phase), _results(other, other.phase.value))
+    return _differing(_results(one), _results(other))
 
 
-def _results(tick: Tick | GuardTick, phase: str | None) -> dict[str, object]:
+def _results(tick: GuardTick) -> dict[str, object]:
     """Return the results of a pass by name, in single precision, that of a recording."""
     stages = {stage: getattr(tick.trace, stage, None) for stage in ActionTrace._fields}
     actions = {name: _single(action) for name, action in (stages | {"sent": tick.sent}).items()}
-    return {"phase": phase, "chunk": tick.chunk_serial, **actions}
+    return {"phase": tick.phase, "chunk": tick.chunk_serial, **actions}
 
 
 def _single(action: Action | None) -> list[float] | None:
@@ -195,9 +195,9 @@ def stick_traces(steps: Sequence[GuardStep], replayed: Iterable[GuardTick | None
     return StickTraces(
         times_s=np.array([(step.recorded.sent_ns - begin_ns) / 1e9 for step in steps]),
         recorded=np.array([_smoothed(step.recorded.trace) for step in steps], np.float64),
-        replayed=np.array([_smoothed(tick and tick.trace) for tick in replayed], np.float32).astype(
-            np.float64
-        ),
+        replayed=np.array(
+            [_smoothed(None if tick is None else tick.trace) for tick in replayed], np.float32
+        ).astype(np.float64),
     )
 
 

@@ -17,6 +17,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
+from mavbridge.core.ticks import GuardTick
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
@@ -26,7 +27,7 @@ from mavbridge.guard.guard import Guard, GuardInput
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
-from mavbridge.guard.wire import GuardTick, ToGuard, decode_from_guard, encode_to_guard
+from mavbridge.guard.wire import ToGuard, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import (
     REOPEN_NS,
@@ -105,7 +106,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
                 port.inbox.append(encode_to_guard(absence))
                 loop.step()
                 absence = None
-        if steps and steps[-1].recorded.phase == tick.phase == Phase.PREPARING.value:
+        if steps and steps[-1].recorded.phase == tick.phase == Phase.PREPARING:
             for _ in _arrived(link, clock, transport, min(tick.woke_ns, tick.due_ns)):
                 loop.step()
         _keep_link(link, clock, transport, tick.woke_ns)
@@ -248,7 +249,7 @@ def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
         reason = dict(reason.data)["first"]  # type: ignore[assignment]
     if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
         return EndRequest(reason=reason, is_fault=reason.kind is Kind.FAULT)
-    if tick.phase == Phase.ENDED.value != was:  # the second of two stops has no effect
+    if tick.phase == Phase.ENDED != was:  # the second of two stops has no effect
         return EndRequest(reason=because(Code.SIGNAL))
     return None
 

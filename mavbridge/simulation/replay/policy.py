@@ -17,7 +17,7 @@ import numpy as np
 
 from mavbridge.core.observers import FanOut
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import FeatureFrame, FloatArray, Solve, Tick, VehicleState
+from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import plan_flight
@@ -25,8 +25,7 @@ from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.state import StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardStatus, GuardTick, Samples
+from mavbridge.guard.wire import GuardStatus, Samples
 from mavbridge.mavlink.session.telemetry import samples_of
 from mavbridge.recording.rows import STATE_STAMPS
 from mavbridge.simulation.clock import SteppedClock
@@ -186,7 +185,7 @@ class _News:
             if tick.sent_ns > now_ns:
                 return
             self._next_tick += 1
-            self._view.receive(_guard_tick(tick))
+            self._view.receive(tick)
 
     def _has_extras(self, place: int, solve: Solve) -> bool:
         """True if, after this packet, the extra inputs equal the solve's.
@@ -221,21 +220,3 @@ def _stamps_ns(now: Telemetry) -> list[int]:
         *(now.velocity_ned_mps, now.specific_force_body_mps2),
     )
     return [0 if reading is None else reading.happened_ns for reading in readings]
-
-
-def _guard_tick(tick: Tick) -> GuardTick:
-    """Rebuild the guard's report that became this tick."""
-    return GuardTick(
-        slot=tick.index if tick.is_slot else None,
-        due_ns=tick.due_ns,
-        woke_ns=tick.woke_ns,
-        decided_ns=tick.decided_ns or tick.woke_ns,
-        sent_ns=tick.sent_ns,
-        missed_slots=tick.missed_slots,
-        is_coasting=tick.is_coasting,
-        chunk_serial=tick.chunk_serial,
-        trace=tick.trace,
-        sent=tick.sent,
-        phase=Phase(tick.phase),
-        reason=tick.release_reason,
-    )

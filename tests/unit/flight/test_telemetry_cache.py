@@ -22,7 +22,7 @@ MS = NS_PER_MS
 STICKS = Sticks(0.2, 0.2, 0.2, 0.2)
 TICK = make_guard_tick(
     START_NS,
-    slot=4,
+    index=4,
     missed_slots=1,
     is_coasting=True,
     chunk_serial=7,
@@ -33,8 +33,10 @@ TICK = make_guard_tick(
 )
 WAIT = because(Code.NO_CHUNK)
 OFF = because(Code.OVERRIDE_SWITCH_OFF)
-NOBODY = TICK._replace(chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason=WAIT)
-LATER = TICK._replace(slot=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
+NOBODY = replace(
+    TICK, chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, release_reason=WAIT
+)
+LATER = replace(TICK, index=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
 SOLVE = make_solve(
     7, frame_ids=((11,), (12,)), started_ns=START_NS - 4 * MS, computed_ns=START_NS - MS
 )
@@ -88,7 +90,7 @@ def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:
     viewed = Viewed()
     viewed.view.remember(SOLVE, CAPTURED_NS)
     status = GuardStatus("ArduPilot", "ALT_HOLD", True, False, (1500,) * 8, STICKS)
-    viewed.receive(status, TICK._replace(slot=3), TICK)
+    viewed.receive(status, replace(TICK, index=3), TICK)
     tick = viewed.sink.ticks[1]
     assert tick.state is SOLVE.state
     assert (tick.feature_frame_id, tick.predict_ns) == (12, 3 * MS)
@@ -103,7 +105,7 @@ def test_a_tick_whose_chunk_is_no_longer_remembered_is_told_without_its_inputs()
     viewed = Viewed()
     for serial in range(7, 8 + MAX_SOLVES):
         viewed.view.remember(replace(SOLVE, serial=serial), CAPTURED_NS)
-    viewed.receive(TICK, TICK._replace(chunk_serial=8))
+    viewed.receive(TICK, replace(TICK, chunk_serial=8))
     forgotten, known = viewed.sink.ticks
     assert (forgotten.predict_ns, forgotten.feature_frame_id, forgotten.state) == (None,) * 3
     assert known.predict_ns == 3 * MS
@@ -114,7 +116,7 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     late_ms: int, is_fresh: bool
 ) -> None:
     viewed = Viewed()
-    viewed.receive(viewed.samples(), NOBODY._replace(sent_ns=START_NS + late_ms * MS))
+    viewed.receive(viewed.samples(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
     (tick,) = viewed.sink.ticks
     assert (tick.state is not None) is is_fresh
     assert tick.release_reason == WAIT
@@ -128,18 +130,18 @@ def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
 
 def test_history_follows_what_was_sent() -> None:
     viewed = Viewed(Contract(history_len=2, history_dt_s=0.01)).receive(TICK)
-    viewed.receive(TICK._replace(sent=None))  # refused by the link: the vehicle flies on
+    viewed.receive(replace(TICK, sent=None))  # refused by the link: the vehicle flies on
     at_ns = TICK.sent_ns + 20 * MS
     assert viewed.view.history.resample(at_ns).tolist() == [[pytest.approx(STICKS)] * 2]
-    viewed.receive(NOBODY._replace(sent_ns=at_ns, phase=Phase.LEAVING))  # no setpoint was due
+    viewed.receive(replace(NOBODY, sent_ns=at_ns, phase=Phase.LEAVING))  # no setpoint was due
     assert viewed.view.history.resample(at_ns + 10 * MS)[0, 1].tolist() == [0.0] * 4
 
 
 def test_flights_are_counted_and_the_phase_is_that_of_the_guard() -> None:
-    viewed = Viewed().receive(NOBODY, TICK, TICK, NOBODY._replace(phase=Phase.RELEASED), TICK)
+    viewed = Viewed().receive(NOBODY, TICK, TICK, replace(NOBODY, phase=Phase.RELEASED), TICK)
     assert viewed.view.flights == 2
     assert viewed.view.phase is Phase.FLYING
-    viewed.receive(NOBODY._replace(phase=Phase.RELEASING, reason=OFF))
+    viewed.receive(replace(NOBODY, phase=Phase.RELEASING, release_reason=OFF))
     assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, OFF)
 
 
@@ -199,9 +201,9 @@ def test_a_guard_that_is_gone_is_waited_for_no_longer_than_asked(awaited: Awaite
 
 def test_missed_slots_count_between_two_ticks_of_the_flight_alone() -> None:
     """Not those before it, nor those of the way out, of the release and after it."""
-    leaving = NOBODY._replace(phase=Phase.LEAVING, sent=STICKS, missed_slots=10)
+    leaving = replace(NOBODY, phase=Phase.LEAVING, sent=STICKS, missed_slots=10)
     viewed = Viewed().receive(
-        *(NOBODY, TICK, LATER, LATER._replace(slot=9, missed_slots=2), NOBODY, NOBODY),
-        *(leaving, leaving, TICK, LATER._replace(missed_slots=0)),
+        *(NOBODY, TICK, LATER, replace(LATER, index=9, missed_slots=2), NOBODY, NOBODY),
+        *(leaving, leaving, TICK, replace(LATER, missed_slots=0)),
     )
     assert [tick.missed_slots for tick in viewed.sink.ticks] == [0, 0, 1, 2, 0, 0, 0, 0, 0, 0]

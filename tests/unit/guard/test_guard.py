@@ -134,24 +134,24 @@ class Stepped:
 def test_while_nobody_asks_us_to_fly_slots_pass_and_nothing_is_sent() -> None:
     guard = Stepped()
     slots = [guard.step(at_ms, guard.chunk(at_ms)).tick for at_ms in range(0, 100, 5)]
-    assert [tick.slot for tick in slots if tick.slot is not None] == list(range(10))
+    assert [tick.index for tick in slots if tick.is_slot] == list(range(10))
     assert guard.decisions == []
 
 
 def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() -> None:
     guard = Stepped().engaged()
     early = guard.step(33, guard.chunk(33))
-    assert (early.decision, early.tick.slot) == (Command(action=WANTED), None)
+    assert (early.decision, early.tick.is_slot) == (Command(action=WANTED), False)
     assert early.tick.missed_slots == 0
     served = guard.step(40)  # 7 ms later
-    assert served.tick.slot == 4
+    assert served.tick.index == 4
     assert served.decision == Command(action=WANTED)
     again = guard.step(46, guard.chunk(46))
-    assert (again.decision, again.tick.slot) == (Command(action=WANTED), None)
+    assert (again.decision, again.tick.is_slot) == (Command(action=WANTED), False)
     left_out = guard.step(50)  # 4 ms later
-    assert (left_out.decision, left_out.tick.slot) == (None, None)
+    assert (left_out.decision, left_out.tick.is_slot) == (None, False)
     after = guard.step(60)
-    assert (after.tick.slot, after.tick.missed_slots) == (6, 0)
+    assert (after.tick.index, after.tick.missed_slots) == (6, 0)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_change_of_hands_does_not_wait_for_a_slot(
 ) -> None:
     guard = Stepped().engaged()
     output = guard.step(31, act=act, **changes)
-    assert (output.decision, output.tick.slot) == (expected, None)
+    assert (output.decision, output.tick.is_slot) == (expected, False)
 
 
 def test_what_has_not_changed_is_not_sent_between_slots() -> None:
@@ -234,7 +234,7 @@ def spent(reason: Reason | None) -> tuple[Any, Any]:
 
 def test_a_computer_that_stood_still_is_told_as_that() -> None:
     tick = Stepped().engaged().step(30 + 131).tick
-    assert spent(tick.reason) == ("computer", 131)
+    assert spent(tick.release_reason) == ("computer", 131)
     assert (tick.due_ns, tick.missed_slots) == (START_NS + 160 * MS, 12)
 
 
@@ -242,7 +242,7 @@ def test_a_guard_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_
     guard = Stepped().engaged()
     stood = guard.step(30 + 2000, guard.chunk(30 + 2000))
     assert stood.decision == Command(action=NEUTRAL)
-    assert spent(stood.tick.reason) == ("guard", 2000)
+    assert spent(stood.tick.release_reason) == ("guard", 2000)
     assert guard.step(2040, guard.chunk(2040)).decision in (Command(action=NEUTRAL), None)
 
 
@@ -263,7 +263,7 @@ def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_
                 break
             assert output.tick.is_coasting == (at_ms > 50)
         silent = late("attitude", 110 * MS, 100 * MS, "link", 110 * MS)
-        assert (output.tick.reason == silent) == (heard_until_ms < 230)
+        assert (output.tick.release_reason == silent) == (heard_until_ms < 230)
         return at_ms - 10
 
     assert flies_until_ms(1000) == 330, "300 ms after its last chunk"
@@ -317,13 +317,13 @@ def test_the_link_is_named_where_it_has_not_brought_one_reading_for_longest(
     )
     for at_ms in range(40, 150, 10):
         output = guard.step(at_ms)
-    assert output.tick.reason == late(name, 113 * MS, 50 * MS, "link", 130 * MS)  # type: ignore[arg-type]
+    assert output.tick.release_reason == late(name, 113 * MS, 50 * MS, "link", 130 * MS)  # type: ignore[arg-type]
 
 
 def test_a_link_that_delays_attitudes_is_named_for_it() -> None:
     guard = Stepped().engaged()
     guard.telemetry = Telemetry(rate_body_radps=Reading(START_NS, (0.0,) * 3, delay_ns=500 * MS))
-    assert spent(guard.step(161).tick.reason) == ("lag", 500)
+    assert spent(guard.step(161).tick.release_reason) == ("lag", 500)
 
 
 @pytest.mark.parametrize("readonly", [False, True])
@@ -387,7 +387,7 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     for at_ms in range(40, 740, 10):
         guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
     assert guard.guard.outcome.faults == 1
-    assert because(Code.BATTERY) in [o.tick.reason for o in guard.outputs]
+    assert because(Code.BATTERY) in [o.tick.release_reason for o in guard.outputs]
 
 
 def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
@@ -568,7 +568,7 @@ def test_a_landing_counts_from_the_beginning_of_each_flight() -> None:
     for at_ms in range(50, 800, 10):
         guard.step(at_ms, guard.chunk(at_ms), is_landed=True)
     assert guard.outputs[-1].tick.phase is Phase.RELEASED
-    assert guard.outputs[-1].tick.reason == because(Code.LANDED)
+    assert guard.outputs[-1].tick.release_reason == because(Code.LANDED)
     guard.engaged(at_ms=830)  # still armed, on the ground
     for at_ms in range(840, 1600, 10):
         guard.step(at_ms, guard.chunk(at_ms))
@@ -596,7 +596,7 @@ def test_absence_is_the_reason_for_not_flying() -> None:
     guard = Stepped()
     link = LinkSnapshot(telemetry=Telemetry(), status=guard.status, problem=None)
     output = guard.guard.step(START_NS, GuardInput(link=link, absence=because(Code.NO_IMAGE)))
-    assert output.tick.reason == because(Code.NO_IMAGE)
+    assert output.tick.release_reason == because(Code.NO_IMAGE)
 
 
 def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
@@ -605,7 +605,7 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem=because(Code.NO_HEARTBEAT))
     waiting = guard.step(START_NS, GuardInput(link=link, act="engage"))
     assert (waiting.tick.phase, waiting.decision) == (Phase.WAITING, None)
-    assert waiting.tick.reason == because(Code.NO_HEARTBEAT)
+    assert waiting.tick.release_reason == because(Code.NO_HEARTBEAT)
     ended = guard.step(
         START_NS + MS, GuardInput(link=link, stop=EndRequest(reason=because(Code.SIGNAL)))
     )

@@ -9,6 +9,7 @@ from helpers.guard_facts import flight_settings, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, ForwardedPacket, LinkArrivals, Sticks
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
@@ -18,7 +19,6 @@ from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardStatus,
-    GuardTick,
     LastWords,
     Samples,
     ToGuard,
@@ -255,7 +255,7 @@ def test_work_that_begins_before_the_slot_sends_at_the_slot() -> None:
     rig = Rig(lead_ns=MS // 2).flying()
     rig.port.received.clear()
     rig.run(0.5)
-    on_grid = [tick for tick in rig.ticks if tick.slot is not None]
+    on_grid = [tick for tick in rig.ticks if tick.is_slot]
     assert len(on_grid) > 40
     assert {tick.sent_ns - tick.due_ns for tick in on_grid} == {0}
     assert {tick.due_ns - tick.woke_ns for tick in on_grid} == {MS // 2}
@@ -287,7 +287,7 @@ def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> No
     rig.port.inbox.append(b"Snonsense")
     rig.run(0.05)
     assert rig.ticks[-1].phase is Phase.LEAVING
-    assert rig.ticks[-1].reason == because(Code.UNREADABLE)
+    assert rig.ticks[-1].release_reason == because(Code.UNREADABLE)
     waiting = Rig()
     waiting.port.inbox.append(b"Snonsense")
     with pytest.raises(ValueError, match="not a message"):

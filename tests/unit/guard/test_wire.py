@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 from helpers.factories import make_guard_tick
 from helpers.guard_facts import flight_settings
 from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import ACTION_CLASSES, NEUTRAL, Reading, Sample, Telemetry
 from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
     LastWords,
@@ -61,6 +63,7 @@ OF_ANY_KIND = {
     Chunk: chunks,
     Samples: st.builds(Samples, st.lists(readings).map(tuple)),
     LastWords: st.builds(LastWords, receiver=receivers),
+    GuardTick: st.builds(GuardTick, phase=st.sampled_from(Phase)),
 }
 
 

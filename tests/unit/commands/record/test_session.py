@@ -68,7 +68,7 @@ class Viewed:
         )
 
     def tick(self, at_ns: int) -> Tick:
-        self.view.receive(make_guard_tick(at_ns, reason=because(Code.NO_IMAGE)))
+        self.view.receive(make_guard_tick(at_ns, release_reason=because(Code.NO_IMAGE)))
         event = self.sink.events[-1]
         assert isinstance(event, Tick)
         return event
