@@ -115,21 +115,13 @@ IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
 """Throttle at the bottom, the rest centred, as arming demands."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
-    """Action to hold until the next command."""
-
-    action: Action
-
-
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Leave the sticks to the pilot. ``reason`` is shown to the user."""
-
-    reason: Reason
+    """Leave the sticks to the pilot."""
 
 
-Decision: TypeAlias = Command | Release
+Decision: TypeAlias = Action | Release
+"""An action is held until the next decision."""
 
 
 class Reading(NamedTuple):

@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.reasons import Code, Reason
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
     Action,
     ActionTrace,
-    Command,
     Decision,
     LinkSnapshot,
     Reading,
@@ -290,11 +289,11 @@ class Guard:
         """
         if control is not ControlSource.POLICY:
             decision = self._at_rest(control)
-            if isinstance(decision, Command):
+            if not isinstance(decision, Release | None):
                 is_neutral = control is ControlSource.NEUTRAL
                 if is_neutral and self._meaning.kind == "velocity":  # brake within the limits
-                    decision = Command(action=self._smoother.step(self._neutral, now_ns).smoothed)
-                self._last = decision.action
+                    decision = self._smoother.step(self._neutral, now_ns).smoothed
+                self._last = decision
             return decision, None
         raw = self._chunks.action_at(now_ns, self._lead_ns)
         # Beyond the horizon, level sticks bridge the rest of the grace.
@@ -304,16 +303,16 @@ class Guard:
         else:
             trace = self._smoother.step(raw or level, now_ns)
             self._last = trace.smoothed
-        return Command(action=trace.smoothed), trace
+        return trace.smoothed, trace
 
     def _at_rest(self, control: ControlSource | None) -> Decision | None:
         """Return the decision of a source other than the policy, without side effects."""
         if control is None:
             return None
         if control is ControlSource.RELEASE:
-            return Release(self._engagement.reason or because(Code.NOT_ENGAGED))
+            return Release()
         resting = {ControlSource.IDLE: self._idle, ControlSource.NEUTRAL: self._neutral}
-        return Command(action=resting.get(control) or self._level(is_thrust=True))
+        return resting.get(control) or self._level(is_thrust=True)
 
     def _level(self, *, is_thrust: bool) -> Action:
         """Return neutral, with the last throttle if the throttle stick is thrust."""

@@ -14,10 +14,10 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
-    Command,
     LinkArrivals,
     LinkSnapshot,
     Outlet,
+    Release,
     VehicleStatus,
 )
 from mavbridge.guard.channel import Port, SocketPort
@@ -203,18 +203,19 @@ class GuardLoop:
             return self._guard.next_ns - self._lead_ns
         self._watch_input(at_ns, given)
         output = self._guard.step(at_ns, given)
-        if isinstance(output.decision, Command):
+        wanted = output.decision
+        is_action = not isinstance(wanted, Release | None)
+        if is_action:
             self._link.send_before_action()
-        if output.decision is not None and at_ns > now_ns:
+        if wanted is not None and at_ns > now_ns:
             self._clock.sleep_until_ns(at_ns)
         self._command_fault = None
-        wanted = output.decision
         sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
-        if isinstance(wanted, Command) and sent is None:
+        if is_action and sent is None:
             self._guard.unsent()
         tick = output.tick
         phase = self._guard.phase
-        if tick.is_slot or output.decision is not None or phase is not self._phase:
+        if tick.is_slot or wanted is not None or phase is not self._phase:
             due_ns, sent_ns = tick.due_ns if tick.is_slot else woke_ns, self._clock.now_ns()
             tick = replace(tick, due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
             self._flight.send(encode_from_guard(tick))

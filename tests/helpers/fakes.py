@@ -10,7 +10,6 @@ from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
-    Command,
     Decision,
     LinkArrivals,
     LinkSnapshot,
@@ -120,7 +119,7 @@ class FakeLink:
         status = self.status
         if status is not None and status.rc_arrived_ns is not None:
             status = replace(status, rc_arrived_ns=self._clock.now_ns())
-        holds = bool(self.decisions) and isinstance(self.decisions[-1][1], Command)
+        holds = bool(self.decisions) and not isinstance(self.decisions[-1][1], Release)
         return LinkSnapshot(
             telemetry=self._telemetry,
             status=status,
@@ -140,7 +139,7 @@ class FakeLink:
     def send(self, decision: Decision, decided_ns: int) -> Action | None:
         self.on_send()
         self.decisions.append((self._clock.now_ns(), decision))
-        return None if isinstance(decision, Release) else decision.action
+        return None if isinstance(decision, Release) else decision
 
     def service(self) -> None:
         self.services += 1

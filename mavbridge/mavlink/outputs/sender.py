@@ -10,7 +10,6 @@ from mavbridge.core.vehicle import (
     Action,
     ActionKind,
     ActionMeaning,
-    Command,
     Decision,
     Output,
     Release,
@@ -108,7 +107,7 @@ class ActionSender:
                 self.try_release()
             return None
         made_ns = self._clock.now_ns() if decided_ns is None else decided_ns
-        encoded = output.encode(decision.action, vehicle, made_ns)
+        encoded = output.encode(decision, vehicle, made_ns)
         if encoded is None or (self.is_release_owed and not self.try_release()):
             return None
         # Before the send: a failed send may still go out.
@@ -138,8 +137,8 @@ class ActionSender:
                 with suppress(Exception):
                     if isinstance(decision, Release) and output is not None:
                         packet = output.release_packet(vehicle, now_ns)
-                    elif isinstance(decision, Command) and output is not None:
-                        encoded = output.encode(decision.action, vehicle, now_ns)
+                    elif not isinstance(decision, Release | None) and output is not None:
+                        encoded = output.encode(decision, vehicle, now_ns)
                         packet = None if encoded is None else encoded.packet
                 if packet is not None:
                     yield after_ns, packet

@@ -10,7 +10,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, ForwardedPacket, LinkArrivals, Sticks
+from mavbridge.core.vehicle import IDLE, NEUTRAL, ForwardedPacket, LinkArrivals, Sticks
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
@@ -147,7 +147,7 @@ def test_the_vehicles_status_is_told_when_it_changes() -> None:
 def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
     rig = Rig().flying()
     sent = [tick for tick in rig.ticks if tick.sent is not None]
-    assert [(tick.sent_ns, Command(action=tick.sent)) for tick in sent] == rig.link.decisions
+    assert [(tick.sent_ns, tick.sent) for tick in sent] == rig.link.decisions
     assert {tick.sent for tick in sent} == {tick.trace.smoothed for tick in sent if tick.trace}
     assert sent[-1].sent == pytest.approx(WANTED)
     assert [tick.chunk_serial for tick in sent] == sorted(tick.chunk_serial for tick in sent)
@@ -270,7 +270,7 @@ def test_a_mode_that_cannot_be_asked_for_does_not_end_the_guard() -> None:
     rig.link.set_mode = refuse  # type: ignore[method-assign]
     rig.loop.stop(EndRequest(reason=because(Code.DURATION), is_fault=True))
     rig.run(6.0)
-    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)  # over an idle receiver
+    assert rig.link.decisions[-1][1] == NEUTRAL  # over an idle receiver
     assert rig.ticks[-1].phase is Phase.HOLDING
 
 
@@ -279,7 +279,7 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
     rig.tell(rig.chunk(), "engage")
     rig.port.is_closed = True
     rig.loop.step()
-    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
+    assert rig.link.decisions[-1][1] == NEUTRAL
 
 
 def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> None:

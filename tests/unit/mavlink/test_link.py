@@ -17,7 +17,7 @@ from mavbridge.core.vehicle import (
     IDLE,
     ActionMeaning,
     AdviceText,
-    Command,
+    Decision,
     ForwardedPacket,
     LinkSnapshot,
     Percentiles,
@@ -157,7 +157,7 @@ class Rig:
         self.ticks = 0
         self.texts: list[str] = []
 
-    def run(self, duration_s: float, decision: Command | Release | None = None) -> LinkSnapshot:
+    def run(self, duration_s: float, decision: Decision | None = None) -> LinkSnapshot:
         for _ in range(round(duration_s * 100)):
             self.vehicle.tick(self.ticks)
             self.ticks += 1
@@ -189,7 +189,7 @@ class Rig:
         return [(m.param1, m.param2) for m in messages if m.command == number]
 
 
-PILOTS = Release(because(Code.PILOT_FLIES))
+PILOTS = Release()
 RELEASE_US = [0, 0, 0, 0, 65535, 65535, 65535, 65535]
 
 
@@ -232,7 +232,7 @@ def test_we_beat_once_a_second_and_as_a_ground_station_to_px4_alone(is_px4: bool
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
     rig = Rig().ready()
     for k in range(2):
-        rig.run(0.2, Command(action=IDLE))
+        rig.run(0.2, IDLE)
         count = len(rig.overrides())
         rig.run(0.01, PILOTS)
         assert rig.overrides()[count:] == [RELEASE_US]  # in the same tick
@@ -240,7 +240,7 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
         rig.run(1.0)  # nobody asks
         assert rig.overrides()[count:] == [RELEASE_US] * (2 + k)
     rig.run(0.01, PILOTS)
-    rig.run(0.01, Command(action=IDLE))
+    rig.run(0.01, IDLE)
     count = len(rig.overrides())
     rig.run(0.01, PILOTS)
     assert rig.overrides()[count:] == [RELEASE_US]  # the last one was before an override
@@ -253,7 +253,7 @@ def test_the_report_tells_of_echo_and_clocks() -> None:
     rig = Rig().ready()
     told = rig.link.stats()
     assert told.echo_confirmed is None  # nothing was sent
-    rig.run(0.8, Command(action=IDLE))
+    rig.run(0.8, IDLE)
     told = rig.link.stats()
     assert (told.sent_overrides, told.echo_confirmed) == (80, True)
     assert told.rtt_ms == Percentiles(p50=0.0, p99=0.0, p999=0.0, max=0.0)
@@ -265,7 +265,7 @@ def test_the_report_tells_of_echo_and_clocks() -> None:
 def test_readonly_sends_no_stick() -> None:
     # Heard in time, it may settle; nobody records its packets.
     rig = Rig(readonly=True, connect_timeout_s=0.1, keeps_packets=False).ready()
-    rig.run(1.0, Command(action=IDLE))
+    rig.run(1.0, IDLE)
     assert rig.samples
     assert rig.packets == []
     assert rig.overrides() == []
@@ -321,7 +321,7 @@ def test_in_flight_a_vehicle_is_followed_each_time_that_it_moves() -> None:
     rig.link.is_engaged = True
     for port in (2, 1, 2, 1):
         rig.vehicle.address = ("127.0.0.1", port)
-        rig.run(1.0, Command(action=IDLE))  # a heartbeat comes before it counts as moved
+        rig.run(1.0, IDLE)  # a heartbeat comes before it counts as moved
         assert rig.vehicle.answered_to == rig.vehicle.address
 
 
@@ -334,7 +334,7 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     for _ in range(3):
         stranger = Received(WireEnd().heartbeat(mode=9), rig.clock.now_ns(), ("10.0.0.9", 4))
         rig.vehicle.inbox.append(stranger)
-        snapshot = rig.run(1.0, Command(action=IDLE))
+        snapshot = rig.run(1.0, IDLE)
     assert (snapshot.interruption, snapshot.problem) == (None, None)
     assert snapshot.status is not None
     assert snapshot.status.mode == "ALT_HOLD"
@@ -383,14 +383,14 @@ def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
 
 def test_without_a_policy_nothing_is_sent() -> None:
     rig = Rig(meaning=None)
-    assert rig.run(8.0, Command(action=IDLE)).problem == because(Code.NO_POLICY_LOADED)
+    assert rig.run(8.0, IDLE).problem == because(Code.NO_POLICY_LOADED)
     assert rig.overrides() == []
     with pytest.raises(PeerError, match="--output rc-override"):
         rig.link.begin_flight(ActionMeaning(), "manual-control")
     rig.link.begin_flight(ActionMeaning(), None)
     assert rig.run(0.1, PILOTS).problem is None
     assert rig.overrides() == []  # nothing is released that was never overridden
-    assert rig.run(0.1, Command(action=IDLE)).echo_confirmed
+    assert rig.run(0.1, IDLE).echo_confirmed
 
 
 def test_acks_for_other_stations_are_ignored() -> None:
