@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
-from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
+from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.processes import child_environment
 from mavbridge.core.ticks import GuardTick
 from mavbridge.flight.settings import guard_settings
@@ -21,7 +21,7 @@ from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
-    GuardError,
+    GuardDiedError,
     GuardSummary,
     LastWords,
     ToGuard,
@@ -52,12 +52,6 @@ OWN_TIMEOUT = (
     "the vehicle holds the last sticks or setpoint until its own timeout (ArduPilot: "
     "RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, COM_OF_LOSS_T)"
 )
-
-
-class GuardDiedError(MavbridgeError):
-    """The guard process exited without its summary."""
-
-    exit_code = ExitCode.FAULT
 
 
 class GuardProcess:
@@ -113,8 +107,8 @@ class GuardProcess:
             raise GuardDiedError(f"the guard process has been silent for {timeout_s:g} s")
         self._early = [decode_from_guard(data) for data in self._port.receive()]
         for message in self._early:
-            if isinstance(message, GuardError):
-                raise _as_exception(message)
+            if isinstance(message, MavbridgeError):
+                raise message
         if not self._early and self._port.is_closed:
             raise GuardDiedError("the guard process has ended before it opened the link")
 
@@ -175,8 +169,8 @@ class GuardProcess:
         match message:
             case GuardSummary():
                 self.summary = message
-            case GuardError():
-                self.error = _as_exception(message)
+            case MavbridgeError():
+                self.error = message
             case LastWords():
                 self._keep(message)
             case GuardTick():
@@ -264,18 +258,6 @@ def _spawn(
         pass_fds=passed,
         start_new_session=True,  # the terminal's signals are not for the guard
     )
-
-
-def _as_exception(error: GuardError) -> MavbridgeError:
-    match error.kind:
-        case "user":
-            return UserError(error.text)
-        case "peer":
-            return PeerError(error.text)
-        case "bug":
-            return GuardDiedError(
-                f"the guard process has failed, a bug of mavbridge:\n{error.text}"
-            )
 
 
 def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> GuardProcess:

@@ -9,6 +9,7 @@ from dataclasses import fields
 from itertools import groupby
 
 from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Position, Solve, Tick, TickSink, VehicleState
 from mavbridge.core.ticks import GuardTick
@@ -21,7 +22,6 @@ from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
-    GuardError,
     GuardStatus,
     GuardSummary,
     LastWords,
@@ -166,7 +166,7 @@ class TelemetryCache:
                 self._texts.append(text)
             case Packets(packets):
                 self._watch_packets(packets)
-            case GuardError() | GuardSummary() | LastWords():
+            case MavbridgeError() | GuardSummary() | LastWords():
                 pass  # its end is the business of whoever has started it
 
     def _receive_samples(self, samples: Iterable[Sample]) -> None:

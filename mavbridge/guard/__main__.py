@@ -10,22 +10,22 @@ import signal
 import socket
 import sys
 import traceback
+from contextlib import ExitStack
 
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
-from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.realtime import settle_guard
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.settings import GuardSettings
-from mavbridge.guard.values import EndRequest
+from mavbridge.guard.values import EndRequest, Outcome
 from mavbridge.guard.wire import (
-    GuardError,
+    GuardDiedError,
     GuardSummary,
     decode_to_guard,
     encode_from_guard,
 )
-from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.signing_files import SigningStore
@@ -53,39 +53,30 @@ def main() -> None:
     if not isinstance(settings, GuardSettings):
         sys.exit("the flight process sent no settings")
     try:
-        _run(settings, port, samples, later)
+        with ExitStack() as stack:
+            _run(settings, port, samples, later, stack)
     except MavbridgeError as error:
-        is_user = isinstance(error, UserError)
-        reason = GuardError("user" if is_user else "peer", str(error))
-        port.finish(encode_from_guard(reason), LAST_WORDS_S)
+        kind = UserError if isinstance(error, UserError) else PeerError
+        port.finish(encode_from_guard(kind(str(error))), LAST_WORDS_S)
         sys.exit(1)
     except Exception:  # noqa: BLE001 - the flight process shows it
-        port.finish(encode_from_guard(GuardError("bug", traceback.format_exc())), LAST_WORDS_S)
+        failed = f"the guard process has failed, a bug of mavbridge:\n{traceback.format_exc()}"
+        port.finish(encode_from_guard(GuardDiedError(failed)), LAST_WORDS_S)
         sys.exit(2)
 
 
 def _run(
-    settings: GuardSettings, port: SocketPort, samples: SocketPort, received: list[bytes]
-) -> None:
-    clock, files = MonotonicClock(), settings.link.signing
-    if files is None:
-        _fly(settings, port, samples, received, clock, None)
-        return
-    with (store := SigningStore(files, clock)) as signing:
-        if store.problem is not None:
-            port.send(encode_from_guard(store.problem))
-        _fly(settings, port, samples, received, clock, signing)
-
-
-def _fly(
     settings: GuardSettings,
     port: SocketPort,
     samples: SocketPort,
     received: list[bytes],
-    clock: MonotonicClock,
-    signing: Signing | None,
+    stack: ExitStack,
 ) -> None:
-    log = None
+    clock, log, signing = MonotonicClock(), None, None
+    if settings.link.signing is not None:
+        signing = stack.enter_context(store := SigningStore(settings.link.signing, clock))
+        if store.problem is not None:
+            port.send(encode_from_guard(store.problem))
     if settings.tlog_fd is not None:
         log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
     transport = make_transport(settings.link.connect, clock)
@@ -110,11 +101,12 @@ def _fly(
         raise
     finally:
         link.close()
+    engagement = loop.guard.engagement if loop.guard else None
     summary = GuardSummary(
         autopilot=link.autopilot,
         link=link.stats(),
-        failure=loop.failure,
-        outcome=loop.outcome,
+        failure=engagement.failure if engagement else None,
+        outcome=engagement.outcome if engagement else Outcome(),
         params=dict(link.known_params),
         dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,

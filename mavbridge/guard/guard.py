@@ -32,7 +32,6 @@ from mavbridge.guard.values import (
     EndRequest,
     EngagementInputs,
     OperatorCommand,
-    Outcome,
     Phase,
     StickGrid,
 )
@@ -84,7 +83,7 @@ class Guard:
         self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
         """Lead for sampling a chunk, at most to its end; compensates the low-pass lag."""
         self._envelope = Envelope(settings.envelope)
-        self._engagement = Engagement(settings.engagement, chunk_period_ns=settings.chunk_period_ns)
+        self.engagement = Engagement(settings.engagement, chunk_period_ns=settings.chunk_period_ns)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
         self._stepped_ns = self._heard_ns = now_ns
         """``_stepped_ns``: last step. ``_heard_ns``: end of the last stall, from which silence of
@@ -102,25 +101,10 @@ class Guard:
         return self._grid.next_ns
 
     @property
-    def phase(self) -> Phase:
-        """State of the engagement."""
-        return self._engagement.phase
-
-    @property
-    def failure(self) -> Reason | None:
-        """Why there was no flight; None: there was one, or it may still begin."""
-        return self._engagement.failure
-
-    @property
-    def outcome(self) -> Outcome:
-        """Outcome of the flights so far."""
-        return self._engagement.outcome
-
-    @property
     def ways_out(self) -> str:
         """Acts that end the neutral sticks of HOLDING, in words."""
         # PX4 ignores the transmitter's own switches while our sticks flow.
-        seen, engagement = self._seen, self._engagement
+        seen, engagement = self._seen, self.engagement
         place = " by a ground station" if seen is not None and seen.link.modes.override else ""
         is_heeded = engagement.heeds_switch and seen and switch_unseen(engagement, seen) is None
         switch = ", or put the engage switch low" if is_heeded else ""
@@ -130,13 +114,13 @@ class Guard:
         """Yield delay [ns], decision and requested mode of each last word, if the guard dies."""
         if self._seen is None:
             return
-        for after_ns, actions in self._engagement.rehearse(self._seen):
+        for after_ns, actions in self.engagement.rehearse(self._seen):
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
         """Discard the last decision, which was not sent; continue from the one before. A read-only
         flight goes on as if it were sent."""
-        if not self._engagement.settings.readonly:
+        if not self.engagement.settings.readonly:
             self._smoother.undo()
             self._grid.unserve()
 
@@ -149,13 +133,13 @@ class Guard:
         if given.absence is not None:
             self._chunks.explain_absence(given.absence, now_ns)
         if given.stop is not None:
-            self._engagement.stop(given.stop)
-        phase_before = self._engagement.phase
+            self.engagement.stop(given.stop)
+        phase_before = self.engagement.phase
         silence = self._silence(now_ns, stood_ns, given.link.telemetry.ned_from_body_wxyz)
         inputs = self._seen = self._inputs(now_ns, given, overdue or silence)
-        actions = self._engagement.step(inputs, given.act)
+        actions = self.engagement.step(inputs, given.act)
         self._change_control(actions.control, now_ns, given.link)
-        phase = self._engagement.phase
+        phase = self.engagement.phase
         # Skip a slot that was just served; send a new chunk and a change of phase at once.
         slot = self._grid.take(now_ns)
         is_urgent = phase is not phase_before or (
@@ -180,8 +164,8 @@ class Guard:
             trace=trace,
             sent=None,
             phase=phase,
-            release_reason=self._engagement.reason,
-            starting_ns=self._engagement.starting_ns or 0,
+            release_reason=self.engagement.reason,
+            starting_ns=self.engagement.starting_ns or 0,
         )
         return GuardOutput(
             decision=decision, actions=actions, messages=self._take_messages(), tick=tick
@@ -200,7 +184,7 @@ class Guard:
 
     def _overdue(self, now_ns: int, stood_ns: int, given: GuardInput) -> Reason | None:
         """Return the reason if an input of the policy's flight is too late, or None."""
-        if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
+        if self.engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
             return None
         seen = given.link.telemetry
         readings = {
@@ -222,13 +206,13 @@ class Guard:
     def _inputs(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> EngagementInputs:
         link, status = given.link, given.link.status
         chunk_fault = given.command_fault or overdue
-        is_flying = self._engagement.phase is Phase.FLYING
+        is_flying = self.engagement.phase is Phase.FLYING
         if chunk_fault is None and is_flying:
             chunk_fault = self._chunks.fault(now_ns)
         # These block only an engagement, so they are skipped in flight. A read-only flight is only
         # shown as FLYING, so they are always checked there.
-        is_sought = not is_flying or self._engagement.settings.readonly
-        starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
+        is_sought = not is_flying or self.engagement.settings.readonly
+        starting_ns, newest = self.engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns
         left: Reason | None = None
         if status is not None:
@@ -322,7 +306,7 @@ class Guard:
         return neutral
 
     def _take_messages(self) -> tuple[str, ...]:
-        refusal, self._engagement.refusal = self._engagement.refusal, None
+        refusal, self.engagement.refusal = self.engagement.refusal, None
         if refusal is not None:
             self._messages.append(str(refusal))
         messages, self._messages = tuple(self._messages), []

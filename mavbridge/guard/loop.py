@@ -24,7 +24,7 @@ from mavbridge.guard.channel import Port, SocketPort
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import (
     GuardStatus,
     LastWords,
@@ -87,7 +87,8 @@ class GuardLoop:
         self._link = link
         self._flight = flight
         self._samples = samples or flight
-        self._guard: Guard | None = None
+        self.guard: Guard | None = None
+        """None until the flight's settings have come."""
         self._vehicle: VehicleStatus | None = None
         self._status: GuardStatus | None = None
         """Last status sent to the flight process."""
@@ -109,16 +110,6 @@ class GuardLoop:
         self._stepped_ns = 0
         self.is_done = False
         """True once control has been given back and no further flight will follow."""
-
-    @property
-    def failure(self) -> Reason | None:
-        """Why there was no flight; None: there was one, or it may still begin."""
-        return None if self._guard is None else self._guard.failure
-
-    @property
-    def outcome(self) -> Outcome:
-        """Outcome of the flights so far."""
-        return Outcome() if self._guard is None else self._guard.outcome
 
     def stop(self, ending: EndRequest) -> None:
         """End at the next step, as ``ending`` demands; the first request counts."""
@@ -150,16 +141,16 @@ class GuardLoop:
 
     def _prepare_words(self, outlet: Outlet) -> None:
         """Give the flight process the packets to send if this process dies."""
-        if self._guard is None:
+        if self.guard is None:
             return
-        is_held = self._guard.phase in _TAKEN and outlet.fd is not None
-        plan = tuple(self._guard.rehearse()) if is_held else ()
+        is_held = self.guard.engagement.phase in _TAKEN and outlet.fd is not None
+        plan = tuple(self.guard.rehearse()) if is_held else ()
         before, self._words = self._words, self._link.rehearse(plan)
         if not (before or self._words):
             return
         mode = next((mode for _, _, mode in plan if mode is not None), None)
         is_new = bool(self._words) and outlet != self._words_outlet
-        words = LastWords(self._guard.phase, mode, outlet.receiver, is_new, self._words)
+        words = LastWords(self.guard.engagement.phase, mode, outlet.receiver, is_new, self._words)
         is_told = self._flight.send(encode_from_guard(words), outlet.fd if is_new else None)
         self._words_outlet = outlet if is_told and self._words else None
 
@@ -190,19 +181,19 @@ class GuardLoop:
         snapshot = self._link.snapshot()
         self._report_vehicle(snapshot)
         given = self._receive(snapshot)
-        if self._guard is None:
+        if self.guard is None:
             self._link.service()
             if given.stop is not None:
                 self._finish(woke_ns)
             return woke_ns + IDLE_PERIOD_NS
         # Compute for a slot that is about to come due, so that only the send is left.
-        now_ns, slot_ns = self._clock.now_ns(), self._guard.next_ns
+        now_ns, slot_ns = self._clock.now_ns(), self.guard.next_ns
         at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
         if not self._has_work(snapshot, given, at_ns, slot_ns):
             self._link.service()
-            return self._guard.next_ns - self._lead_ns
+            return self.guard.next_ns - self._lead_ns
         self._watch_input(at_ns, given)
-        output = self._guard.step(at_ns, given)
+        output = self.guard.step(at_ns, given)
         wanted = output.decision
         is_action = not isinstance(wanted, Release | None)
         if is_action:
@@ -212,9 +203,9 @@ class GuardLoop:
         self._command_fault = None
         sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
         if is_action and sent is None:
-            self._guard.unsent()
+            self.guard.unsent()
         tick = output.tick
-        phase = self._guard.phase
+        phase = self.guard.engagement.phase
         if tick.is_slot or wanted is not None or phase is not self._phase:
             due_ns, sent_ns = tick.due_ns if tick.is_slot else woke_ns, self._clock.now_ns()
             tick = replace(tick, due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
@@ -227,7 +218,7 @@ class GuardLoop:
         if phase is Phase.ENDED:
             self._finish(woke_ns)
         # After a failed command the next pass follows at once.
-        return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
+        return woke_ns if self._command_fault else self.guard.next_ns - self._lead_ns
 
     def _has_work(
         self, snapshot: LinkSnapshot, given: GuardInput, at_ns: int, slot_ns: int
@@ -290,9 +281,9 @@ class GuardLoop:
     def _forward(self, arrivals: LinkArrivals) -> int:
         """Pass samples and packets on. Return the arrival of the last packet, or 0."""
         # The flight process does not read samples before a policy is loaded; keep the queue free.
-        if arrivals.samples and self._guard is not None:
+        if arrivals.samples and self.guard is not None:
             self._samples.send(encode_samples(arrivals.samples))
-        if arrivals.packets and self._guard is not None:
+        if arrivals.packets and self.guard is not None:
             self._flight.send(encode_from_guard(Packets(arrivals.packets)))
         return arrivals.packets[-1].arrived_ns if arrivals.packets else 0
 
@@ -338,8 +329,8 @@ class GuardLoop:
                     absence = None
                 case Reason() as absence:
                     pass
-                case FlightSettings() as settings if self._guard is None:
-                    self._guard = Guard(settings, self._clock.now_ns())
+                case FlightSettings() as settings if self.guard is None:
+                    self.guard = Guard(settings, self._clock.now_ns())
                     self._watches_position = settings.watches_position
                     self._link.begin_flight(
                         settings.meaning,
@@ -373,8 +364,8 @@ class GuardLoop:
                 text = "the policy has control"
             case Phase.LEAVING:
                 text = f"neutral: {reason}"
-            case Phase.HOLDING if self._guard is not None:
-                text = f"neutral sticks go on until {self._guard.ways_out}"
+            case Phase.HOLDING if self.guard is not None:
+                text = f"neutral sticks go on until {self.guard.ways_out}"
                 self._flight.send(encode_from_guard(text))
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
                 text = f"control given back: {reason}"

@@ -12,9 +12,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from itertools import chain
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
+from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
@@ -84,11 +85,10 @@ class LastWords(NamedTuple):
     """Delay after the death [ns] and bytes of each packet; empty: nothing is held, send nothing."""
 
 
-class GuardError(NamedTuple):
-    """Error that ends the guard."""
+class GuardDiedError(MavbridgeError):
+    """The guard process exited without its summary."""
 
-    kind: Literal["user", "peer", "bug"]
-    text: str
+    exit_code = ExitCode.FAULT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,9 +111,18 @@ class GuardSummary:
 ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | Reason | OperatorCommand | EndRequest
 """A reason tells why the flight process cannot compute a chunk now."""
 FromGuard: TypeAlias = (
-    Samples | Packets | GuardTick | GuardStatus | str | LastWords | GuardError | GuardSummary
+    Samples
+    | Packets
+    | GuardTick
+    | GuardStatus
+    | str
+    | LastWords
+    | GuardSummary
+    | UserError
+    | PeerError
+    | GuardDiedError
 )
-"""Text is one line for the user."""
+"""Text is one line for the user; an error ends the guard."""
 
 _TO_GUARD = (GuardSettings, FlightSettings, Reason, str, EndRequest)
 

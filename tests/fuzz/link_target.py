@@ -144,7 +144,7 @@ class HostileFlight:
     def _is_ready(self) -> bool:
         """An engage would be obeyed, as far as the link and the inputs are concerned."""
         self.flight.link.receive()
-        guard, link = self.flight.guard._guard, self.flight.link.snapshot()
+        guard, link = self.flight.guard.guard, self.flight.link.snapshot()
         assert guard is not None
         if link.status is None or link.problem is not None:
             return False

@@ -194,7 +194,7 @@ class GuardWorld:
 
     @property
     def phase(self) -> Phase:
-        return self.guard.phase
+        return self.guard.engagement.phase
 
     # --- the flight process
 

@@ -62,7 +62,7 @@ class GuardMachine(RuleBasedStateMachine):
         else:
             self.act("engage")
         assert self.world.phase in (Phase.FLYING, Phase.PREPARING), (
-            self.world.guard._engagement.refusal
+            self.world.guard.engagement.refusal
         )
         self.advance(300)
         assert self.world.phase is Phase.FLYING
@@ -243,7 +243,7 @@ class GuardMachine(RuleBasedStateMachine):
         self.world.vehicle.is_failsafe = is_failsafe
         self.must_end = is_failsafe
         self.step()
-        reason = self.world.guard._engagement.reason
+        reason = self.world.guard.engagement.reason
         is_px4, is_kept = self.world.autopilot == "px4", self.world.vehicle.mode == self.world.mode
         if was_flying and not is_px4 and is_kept and reason and reason.codes == (Code.FAILSAFE,):
             assert self.world.phase is Phase.LEAVING, "nobody flies a vehicle that keeps the mode"

@@ -22,13 +22,12 @@ from mavbridge.flight import guard_process
 from mavbridge.flight.guard_process import (
     LATEST_NS,
     SILENT_WAITS,
-    GuardDiedError,
     GuardProcess,
 )
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard
+from mavbridge.guard.wire import GuardDiedError, LastWords, encode_from_guard
 
 MS = NS_PER_MS
 PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
@@ -241,7 +240,7 @@ def test_nothing_is_sent_where_it_would_be_wrong(rig: Rig, case: str) -> None:
     elif case == "old":
         rig.clock.advance_ns(LATEST_NS + MS)
     if case == "a bug":  # it has said them itself
-        rig.port.send(encode_from_guard(GuardError("bug", "Traceback")))
+        rig.port.send(encode_from_guard(GuardDiedError("Traceback")))
     text = rig.die(None if case == "alive" else -9)
     assert link.heard() == []
     assert ("its own timeout" in text) == (case in ("old", "alive"))

@@ -15,7 +15,7 @@ from mavbridge.core.vehicle import Reading, Sticks, Telemetry
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardError, GuardStatus, Samples, encode_samples
+from mavbridge.guard.wire import GuardDiedError, GuardStatus, Samples, encode_samples
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -123,7 +123,7 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
 
 
 def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
-    viewed = Viewed().receive(NOBODY, "one", "two", NOBODY, NOBODY, GuardError("bug", "three"))
+    viewed = Viewed().receive(NOBODY, "one", "two", NOBODY, NOBODY, GuardDiedError("three"))
     assert [tick.serial for tick in viewed.sink.ticks] == [0, 1, 2]
     assert [tick.texts for tick in viewed.sink.ticks] == [(), ("one", "two"), ()]
 

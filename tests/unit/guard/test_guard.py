@@ -119,7 +119,7 @@ class Stepped:
         for k in range(3):
             self.step(at_ms - 30 + 10 * k, self.chunk(at_ms - 30 + 10 * k, sticks))
         self.step(at_ms, self.chunk(at_ms, sticks), act="engage")
-        assert self.guard.phase is Phase.FLYING, self.outputs[-1].messages
+        assert self.guard.engagement.phase is Phase.FLYING, self.outputs[-1].messages
         return self
 
     @property
@@ -258,7 +258,7 @@ def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_
         for at_ms in range(40, 1000, 10):
             guard.telemetry = heard(min(at_ms, heard_until_ms))
             output = guard.step(at_ms)
-            if guard.guard.phase is not Phase.FLYING:
+            if guard.guard.engagement.phase is not Phase.FLYING:
                 break
             assert output.tick.is_coasting == (at_ms > 50)
         silent = late("attitude", 110 * MS, 100 * MS, "link", 110 * MS)
@@ -276,12 +276,12 @@ def test_a_computer_that_stood_still_flies_on_when_chunk_and_vehicle_come_back(
     guard = Stepped(freshness=STALL).engaged()
     guard.telemetry = heard(30)  # a vehicle on the same computer stood still, too
     guard.step(30 + stood_still_ms)
-    assert (guard.guard.phase is Phase.FLYING) == flies
+    assert (guard.guard.engagement.phase is Phase.FLYING) == flies
     if flies:
         fresh_ms = 60 + stood_still_ms
         guard.telemetry = heard(fresh_ms)
         assert not guard.step(fresh_ms, guard.chunk(fresh_ms)).tick.is_coasting
-        assert guard.guard.phase is Phase.FLYING
+        assert guard.guard.engagement.phase is Phase.FLYING
 
 
 @pytest.mark.parametrize(("stood_still_ms", "flies"), [(60, False), (61, True)])
@@ -385,7 +385,7 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     guard = Stepped().engaged()
     for at_ms in range(40, 740, 10):
         guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
-    assert guard.guard.outcome.faults == 1
+    assert guard.guard.engagement.outcome.faults == 1
     assert because(Code.BATTERY) in [o.tick.release_reason for o in guard.outputs]
 
 
@@ -393,14 +393,14 @@ def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
     guard = Stepped(arm=True, status={"armed": False})
     for k in range(8):
         guard.step(10 * k, guard.chunk(10 * k)._replace(attitude_ns=START_NS - 400 * MS))
-    assert codes(guard.guard.failure) == (Code.TOO_SLOW,)
+    assert codes(guard.guard.engagement.failure) == (Code.TOO_SLOW,)
 
 
 def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
     guard = Stepped(arm=True, status={"armed": False})
     guard.step(0, guard.chunk(0))
     guard.step(10, fault=because(Code.COMMAND_FAILED))
-    assert guard.guard.failure == because(Code.COMMAND_FAILED)
+    assert guard.guard.engagement.failure == because(Code.COMMAND_FAILED)
 
 
 def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -> None:
@@ -426,7 +426,7 @@ def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -
     assert {below.decision, above.decision} == {NEUTRAL}
     # The sticks were ours: the policy goes on from them, and not from the receiver's.
     assert guard.step(3120, guard.chunk(3120), mode="ALT_HOLD").decision == NEUTRAL
-    assert guard.guard.phase is Phase.FLYING
+    assert guard.guard.engagement.phase is Phase.FLYING
 
 
 # --- from where
@@ -477,7 +477,7 @@ def test_chunks_that_are_refused_do_not_start_the_filter_anew() -> None:
         at_ms = 40 + 10 * k
         sticks = NEUTRAL if k % 2 else NEUTRAL._replace(roll=float("nan"))
         guard.step(at_ms, guard.chunk(at_ms, sticks), rc_sticks=ECHO)
-    assert guard.guard.phase is Phase.FLYING
+    assert guard.guard.engagement.phase is Phase.FLYING
     assert set(guard.decisions) == {NEUTRAL}
 
 
@@ -605,7 +605,7 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
         START_NS + MS, GuardInput(link=link, stop=EndRequest(reason=because(Code.SIGNAL)))
     )
     assert (ended.tick.phase, ended.decision) == (Phase.ENDED, None)
-    assert guard.failure is None
+    assert guard.engagement.failure is None
 
 
 @pytest.mark.parametrize("tau_s", [0.0, 0.05])

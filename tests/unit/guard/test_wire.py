@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_guard_tick
 from helpers.guard_facts import flight_settings
+from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import ACTION_CLASSES, NEUTRAL, Reading, Sample, Telemetry
@@ -59,6 +60,8 @@ st.register_type_strategy(Reason, reasons)
 st.register_type_strategy(float, numbers)
 st.register_type_strategy(Path, st.just(Path("key")))
 receivers = st.sampled_from((None, ("127.0.0.1", 14550), ("::1", 14550, 0, 0)))
+SAID = get_args(FromGuard)
+ERRORS = [kind for kind in SAID if issubclass(kind, Exception)]
 OF_ANY_KIND = {
     Chunk: chunks,
     Samples: st.builds(Samples, st.lists(readings).map(tuple)),
@@ -71,7 +74,7 @@ OF_ANY_KIND = {
     ("kind", "encode", "decode"),
     [
         *((kind, encode_to_guard, decode_to_guard) for kind in get_args(ToGuard)),
-        *((kind, encode_from_guard, decode_from_guard) for kind in get_args(FromGuard)),
+        *((kind, encode_from_guard, decode_from_guard) for kind in SAID if kind not in ERRORS),
     ],
 )
 @settings(max_examples=30)
@@ -83,6 +86,13 @@ def test_any_message_arrives_as_it_was(
     received = decode(encode(message))
     assert type(received) is type(message)
     assert received == message
+
+
+@pytest.mark.parametrize("kind", ERRORS)
+def test_an_error_arrives_with_its_text_and_exit_status(kind: type[MavbridgeError]) -> None:
+    error: Any = decode_from_guard(encode_from_guard(kind("no vehicle\n")))
+    assert (type(error), str(error)) == (kind, "no vehicle\n")
+    assert error.exit_code is kind.exit_code
 
 
 def test_numbers_of_a_chunk_arrive_bit_by_bit() -> None:
