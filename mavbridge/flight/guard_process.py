@@ -14,7 +14,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.processes import child_environment
 from mavbridge.core.ticks import GuardTick
-from mavbridge.flight.settings import guard_settings
+from mavbridge.flight.settings import link_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.settings import GuardSettings
@@ -265,10 +265,11 @@ def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> GuardProce
     tlog_pipe = None if config.record is None else open_tlog_pipe()
     if tlog_pipe is not None:
         stack.callback(tlog_pipe.close)
-    settings = guard_settings(
-        config,
-        is_dual=config.policy.may_be_dual,
+    settings = GuardSettings(
+        link=link_settings(config, config.rates.loops(is_dual=config.policy.may_be_dual)),
+        realtime=config.rates.realtime,
         tlog_fd=None if tlog_pipe is None else tlog_pipe.writer.fileno(),
+        keeps_packets=tlog_pipe is not None,
         wall_offset_ns=wall_offset_ns(clock),
     )
     guard = GuardProcess(settings, clock)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
+from mavbridge.config.policy import LoopRates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.link_settings import LinkSettings, SigningFiles
@@ -13,33 +14,12 @@ from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import ActionLimits
-from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EngagementSettings
 from policy.contract import ActionKind, Contract
 
 TAU_S: dict[ActionKind, float] = {"sticks": 0.05, "rates": 0.01, "attitude": 0.05, "velocity": 0.05}
 """Default time constants of the low-pass filter. A policy of body rates closes the attitude loop,
 which tolerates no lag of 50 ms."""
-
-
-def guard_settings(
-    config: FlyConfig, *, is_dual: bool, tlog_fd: int | None, wall_offset_ns: int
-) -> GuardSettings:
-    """Return the process settings known before the policy is loaded. Chunks are sent between slots,
-    too."""
-    rates = config.rates
-    return GuardSettings(
-        link=link_settings(
-            config.link,
-            state_hz=rates.loops(is_dual=is_dual).state_hz,
-            stick_hz=rates.stick_rate + rates.loops(is_dual=is_dual).action_hz,
-            min_battery_percent=config.envelope.min_battery,
-        ),
-        realtime=config.rates.realtime,
-        tlog_fd=tlog_fd,
-        keeps_packets=tlog_fd is not None,
-        wall_offset_ns=wall_offset_ns,
-    )
 
 
 def require_goal(config: FlyConfig, contract: Contract) -> None:
@@ -125,28 +105,22 @@ def state_folder() -> Path:
     return root / "mavbridge"
 
 
-def link_settings(
-    config: LinkConfig,
-    *,
-    state_hz: float,
-    stick_hz: float,
-    min_battery_percent: float,
-) -> LinkSettings:
-    """Return the settings of a link that requests telemetry at ``state_hz``."""
-    signing = None
-    if config.signing_key_file is not None:
-        signing = SigningFiles(key_file=config.signing_key_file, state_folder=state_folder())
+def link_settings(config: FlyConfig, loops: LoopRates) -> LinkSettings:
+    """Return the settings of the link. Chunks are sent between slots, too."""
+    link, signing = config.link, None
+    if link.signing_key_file is not None:
+        signing = SigningFiles(key_file=link.signing_key_file, state_folder=state_folder())
     return LinkSettings(
-        connect=config.connect,
-        source_system=config.source_system,
-        target_system=config.target_system,
-        connect_timeout_s=config.connect_timeout,
-        readonly=config.readonly,
-        state_hz=state_hz,
-        min_battery_percent=min_battery_percent,
-        stick_hz=stick_hz,
-        set_params=config.set_params,
-        accepted_risks=config.accept_risk,
+        connect=link.connect,
+        source_system=link.source_system,
+        target_system=link.target_system,
+        connect_timeout_s=link.connect_timeout,
+        readonly=link.readonly,
+        state_hz=loops.state_hz,
+        min_battery_percent=config.envelope.min_battery,
+        stick_hz=config.rates.stick_rate + loops.action_hz,
+        set_params=link.set_params,
+        accepted_risks=link.accept_risk,
         signing=signing,
     )
 

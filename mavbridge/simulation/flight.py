@@ -171,16 +171,8 @@ class SimulatedFlight:
         to_guard = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
         to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)), stalled_ns)
         flight_port = MemoryPort(outgoing=to_guard, incoming=to_flight)
-        link = MavlinkLink(
-            self._transport,
-            world,
-            link_settings(
-                config.link,
-                state_hz=loops.state_hz,
-                stick_hz=config.rates.stick_rate,
-                min_battery_percent=0.0,
-            ),
-        )
+        settings = replace(link_settings(config, loops), min_battery_percent=0.0)
+        link = MavlinkLink(self._transport, world, settings)
         guard = GuardLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_guard))
         contract, policy_clock = runner.contract, AheadClock(world)
         for name, value in needed_params(contract, self._vehicle_config.autopilot).items():

@@ -115,16 +115,8 @@ class GuardFlight:
         to_flight = DelayedChannel(self.clock, hop_ns)
         self._port = MemoryPort(outgoing=to_guard, incoming=to_flight)
         self.guard_port = FlightPort(outgoing=to_flight, incoming=to_guard)
-        self.link = MavlinkLink(
-            self.network,
-            self.clock,
-            link_settings(
-                config.link,
-                state_hz=100.0,
-                stick_hz=config.rates.stick_rate,
-                min_battery_percent=config.envelope.min_battery,
-            ),
-        )
+        settings = replace(link_settings(config, config.rates.loops(is_dual=True)), state_hz=100.0)
+        self.link = MavlinkLink(self.network, self.clock, settings)
         self.guard = GuardLoop(self.clock, self.link, self.guard_port)
         self.features = FreshFeatures(self.clock)
         self.sink = ListSink()

@@ -19,7 +19,7 @@ from mavbridge.core.vehicle import (
     VehicleText,
 )
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.flight.settings import effective_freshness, guard_settings
+from mavbridge.flight.settings import effective_freshness, link_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
@@ -111,7 +111,7 @@ def check_vehicle(
     ``plan`` is None if no policy flies. ``transport`` replaces that of the address in ``config``.
     """
     is_dual = plan is None or plan.is_dual
-    settings = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0).link
+    settings = link_settings(config, config.rates.loops(is_dual=is_dual))
     settings = replace(settings, readonly=True, set_params=())
     rows: list[CheckRow] = []
     try:

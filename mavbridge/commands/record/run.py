@@ -1,6 +1,5 @@
 """One recording session: opens everything, records what ``EpisodeControl`` wants, and closes."""
 
-import threading
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import replace
@@ -11,7 +10,6 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.camera.open import check_camera, open_camera, require_present
 from mavbridge.commands.config import RecordConfig
 from mavbridge.commands.record.episodes import (
@@ -33,7 +31,7 @@ from mavbridge.commands.record.view import (
 )
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import Rates
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread
 from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
@@ -43,8 +41,8 @@ from mavbridge.core.stopping import StopRequest, Worker, stop_on_signals
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.settings import guard_settings
-from mavbridge.flight.vision_loop import VisionLoop
+from mavbridge.flight.settings import link_settings
+from mavbridge.flight.vision_loop import vision_loops
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.transport.sockets import make_transport
@@ -87,16 +85,20 @@ def pilot_flight(config: RecordConfig) -> FlyConfig:
         visual_rate=config.visual_rate,
         realtime=False,
     )
-    return FlyConfig(link=LinkConfig(**vars(config.vehicle), readonly=True), rates=rates)
+    link = LinkConfig(**vars(config.vehicle), readonly=True)
+    return FlyConfig(link=link, camera=config.camera, rates=rates)
 
 
 def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
     """Return settings of a guard that requests the pilot's sticks at the rate of the recording."""
-    settings = guard_settings(
-        pilot_flight(config), is_dual=True, tlog_fd=None, wall_offset_ns=wall_offset_ns(clock)
+    flight = pilot_flight(config)
+    link = link_settings(flight, flight.rates.loops(is_dual=True))
+    return GuardSettings(
+        link=replace(link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0),
+        realtime=False,
+        keeps_packets=True,
+        wall_offset_ns=wall_offset_ns(clock),
     )
-    link = replace(settings.link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0)
-    return replace(settings, link=link, keeps_packets=True)
 
 
 class _Session:
@@ -135,7 +137,16 @@ class _Session:
         plan = plan_flight(pilot_flight(config), CONTRACT, is_dual=True)
         self._view = PilotView(plan, sink=sink, samples=self._guard.samples)
         self._images = FeatureCache()
-        self._vision = self._vision_loop(camera, sink)
+        (self._vision,) = vision_loops(  # encodes nothing, but paces, stamps and judges the images
+            plan,
+            self._view,
+            encode=lambda _image, _camera: NOTHING.copy(),
+            cameras=[camera],
+            caches=[self._images],
+            clocks=[clock],
+            sinks=[sink],
+            watches_images=True,
+        )
         self._guard.send(plan.guard)
 
     def _open_camera(self, console: Console) -> Camera:
@@ -151,23 +162,6 @@ class _Session:
         )
         self._stack.callback(camera.close)
         return camera
-
-    def _vision_loop(self, camera: Camera, sink: TickSink) -> VisionLoop:
-        """Return a loop that encodes nothing, but paces, stamps and judges the images."""
-        return VisionLoop(
-            camera=camera,
-            encode=lambda _image, _camera: NOTHING.copy(),
-            cache=self._images,
-            sink=sink,
-            clock=self._clock,
-            period_ns=period_ns(self._config.visual_rate),
-            encoder_lock=threading.Lock(),
-            image_watch=ImageWatch(
-                max_frozen_s=self._config.camera.max_frozen_image,
-                max_black_s=self._config.camera.max_black_image,
-            ),
-            is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
-        )
 
     def _open_viewer(self) -> TickSink:
         rate = self._config.rate

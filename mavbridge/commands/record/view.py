@@ -43,6 +43,11 @@ class PilotView(TelemetryCache):
         """Arrival of the newest sticks."""
         self.stick_packets = 0
 
+    @property
+    def is_airborne(self) -> bool:
+        """True if the pilot flies: the vehicle is armed and not landed."""
+        return self.status.armed and self.status.is_landed is False
+
     def log_to(self, log: PacketPipe | None) -> None:
         """Log the vehicle's packets here from now on; None: nowhere. The last log is then free."""
         with self._log_lock:

@@ -260,13 +260,8 @@ def _link(
     config: FlyConfig = source.config
     # Use the settings from before a policy was loaded, as when the guard started.
     loops = config.rates.loops(is_dual=source.meta.mode == "dual")
-    settings = link_settings(
-        config.link,
-        state_hz=loops.state_hz,
-        stick_hz=config.rates.stick_rate + loops.action_hz,
-        min_battery_percent=config.envelope.min_battery,
-    )
-    return MavlinkLink(transport, clock, replace(settings, known_params=source.known_params))
+    settings = replace(link_settings(config, loops), known_params=source.known_params)
+    return MavlinkLink(transport, clock, settings)
 
 
 class _RecordedTransport(Transport):

@@ -7,7 +7,9 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +17,8 @@ import pytest
 from helpers.factories import make_guard_tick
 from helpers.fakes import START_NS, FakeClock
 from helpers.wire import needs_ipv6
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.config.policy import Rates
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.link_settings import LinkSettings
@@ -23,6 +27,7 @@ from mavbridge.flight.guard_process import (
     LATEST_NS,
     SILENT_WAITS,
     GuardProcess,
+    start_guard,
 )
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.settings import GuardSettings
@@ -262,3 +267,27 @@ def test_a_guard_that_ended_in_order_unheard_is_not_called_dead(rig: Rig) -> Non
     """Its summary does not fit into the channel of a process that was stopped for long."""
     rig.tick(Phase.RELEASED)
     assert rig.die(returncode=0) == "the guard ended the flight while this process stood still"
+
+
+def test_the_process_is_told_what_the_flags_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[GuardSettings] = []
+
+    def spawn(_ends: tuple[socket.socket, socket.socket], settings: GuardSettings) -> Any:
+        told.append(settings)
+        child = Child()
+        child.returncode = 0
+        return child
+
+    monkeypatch.setattr(guard_process, "_spawn", spawn)
+    link, rates = LinkConfig(connect="udp:127.0.0.1:1"), Rates(realtime=False)
+    with ExitStack() as stack:
+        start_guard(FlyConfig(link=link, rates=rates), FakeClock(), stack)
+        start_guard(FlyConfig(link=link, record=Path("flight")), FakeClock(), stack)
+    unrecorded, recorded = told
+    assert (unrecorded.realtime, unrecorded.tlog_fd, unrecorded.keeps_packets) == (
+        False,
+        None,
+        False,
+    )
+    assert (recorded.realtime, recorded.keeps_packets) == (True, True)
+    assert recorded.tlog_fd is not None

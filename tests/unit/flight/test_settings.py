@@ -15,7 +15,7 @@ from mavbridge.flight.settings import (
     action_meaning,
     contract_with_ages,
     effective_freshness,
-    guard_settings,
+    link_settings,
     state_folder,
 )
 from mavbridge.guard.chunks import FreshnessLimits
@@ -40,14 +40,11 @@ def test_the_process_is_told_what_the_flags_say() -> None:
         rates=Rates(stick_rate=250.0, realtime=False),
         envelope=EnvelopeConfig(min_battery=25.0),
     )
-    settings = guard_settings(config, is_dual=True, tlog_fd=7, wall_offset_ns=5)
-    link = settings.link
+    link = link_settings(config, config.rates.loops(is_dual=True))
     assert (link.connect, link.source_system) == ("udp:127.0.0.1:14550", 254)
     assert (link.state_hz, link.stick_hz, link.min_battery_percent) == (100.0, 350.0, 25.0)
     assert link.set_params == (("RC_OVERRIDE_TIME", 0.5), ("FS_THR_ENABLE", 1.0))
     assert link.accepted_risks == ("slow-serial",)
-    assert settings.realtime is False
-    assert (settings.tlog_fd, settings.wall_offset_ns) == (7, 5)
 
 
 @pytest.mark.parametrize(
