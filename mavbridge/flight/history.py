@@ -1,4 +1,4 @@
-"""Sample chunks and the history of sent actions at given times."""
+"""The history of sent actions at given times."""
 
 import threading
 from bisect import bisect_right
@@ -9,7 +9,7 @@ import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import Action, Sticks
+from mavbridge.core.vehicle import Action
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.limits import ActionSmoother
@@ -18,24 +18,6 @@ from policy.contract import history_ages_ns
 
 REPORTED_NS = 10 * NS_PER_MS
 """Age of a sent action from which the guard has reported it, in flight as in a replay."""
-
-
-def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks:
-    """Return the action of a chunk at a time: linear between its rows, constant beyond them.
-
-    Args:
-        chunk: [horizon, 4]; row k acts ``k * chunk_dt_s`` after the state that it was computed
-            from.
-        chunk_dt_s: time between rows [s].
-        at_s: time since that state [s].
-    """
-    last = len(chunk) - 1
-    position = min(max(at_s / chunk_dt_s, 0.0), float(last))
-    low = int(position)
-    high = min(low + 1, last)
-    weight = position - low
-    a, b = chunk[low].tolist(), chunk[high].tolist()
-    return Sticks(*[(1.0 - weight) * a[k] + weight * b[k] for k in range(4)])
 
 
 class SentHistory:

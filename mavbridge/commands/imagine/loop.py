@@ -15,7 +15,7 @@ from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Action, Sticks
-from mavbridge.flight.history import SentHistory, sample_chunk
+from mavbridge.flight.history import SentHistory
 from policy.contract import SINCE_EXPOSURE_DIM, STICK_TERMS, Contract
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
@@ -203,15 +203,11 @@ class PolicyDecider:
             state = np.pad(state, ((0, 0), (0, SINCE_EXPOSURE_DIM)))
         feature = self._runner.encode(seen.images[-1])
         chunk = self._runner.act(feature, state, seen.history())[0]
-        sticks = [
-            sample_chunk(
-                chunk,
-                chunk_dt_s=self.contract.chunk_dt_s,
-                at_s=(sample + 0.5) / SAMPLES_PER_STEP * self._frame_dt_s,
-            )
-            for sample in range(self._frames * SAMPLES_PER_STEP)
-        ]
-        of_steps = np.array(sticks, np.float32).reshape(self._frames, SAMPLES_PER_STEP, -1)
+        samples = np.arange(self._frames * SAMPLES_PER_STEP)
+        samples_s = (samples + 0.5) / SAMPLES_PER_STEP * self._frame_dt_s
+        rows_s = np.arange(len(chunk)) * self.contract.chunk_dt_s
+        sticks = np.array([np.interp(samples_s, rows_s, stick) for stick in chunk.T], np.float32)
+        of_steps = sticks.T.reshape(self._frames, SAMPLES_PER_STEP, -1)
         clipped: FloatArray = np.clip(of_steps.mean(axis=1), -1.0, 1.0)
         return clipped
 

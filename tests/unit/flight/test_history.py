@@ -6,26 +6,9 @@ from helpers.guard_facts import make_chunk
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import IDLE, NEUTRAL, AttitudeThrust, BodyRates, Sticks, Velocity
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.flight.history import SentHistory, sample_chunk
+from mavbridge.flight.history import SentHistory
 from mavbridge.guard.limits import ActionSmoother
 from policy.contract import Contract
-
-CHUNK = np.array([[0, 0, 0, 0], [1, -1, 0.5, 0], [0, 0, 0, 1]], dtype=np.float32)
-
-
-@pytest.mark.parametrize(
-    ("at_s", "expected"),
-    [
-        (-1.0, (0, 0, 0, 0)),  # before the chunk: its first action
-        (0.0, (0, 0, 0, 0)),
-        (0.025, (0.5, -0.5, 0.25, 0)),
-        (0.05, (1, -1, 0.5, 0)),
-        (0.0875, (0.25, -0.25, 0.125, 0.75)),
-        (9.0, (0, 0, 0, 1)),  # after it: its last
-    ],
-)
-def test_a_chunk_is_read_by_time(at_s: float, expected: tuple[float, ...]) -> None:
-    assert sample_chunk(CHUNK, chunk_dt_s=0.05, at_s=at_s) == pytest.approx(expected)
 
 
 def stick(value: float) -> Sticks:
