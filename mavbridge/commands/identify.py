@@ -57,8 +57,7 @@ STEADY, RESTED = 0.1, np.array([0.01, 0.1])
 rest, in the first and in the second push. The first tells a limited rate from a slow lag."""
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
 """Time by which a push ends early because of the smoothing's lag; time used before a push, and at
-the end of a pause; longest gap in sends of a flying policy; time for the climb before the
-doublet."""
+the end of a pause; longest gap in sends of a flying policy; time to climb before the doublet."""
 
 
 class Channel(NamedTuple):

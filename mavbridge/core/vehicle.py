@@ -156,6 +156,12 @@ class Telemetry(NamedTuple):
     height_above_home_m: Reading | None = None
     """One number; requested only if the policy takes it."""
 
+    @property
+    def attitude_ns(self) -> int:
+        """Arrival of the newest attitude; 0 before the first."""
+        attitude = self.ned_from_body_wxyz
+        return 0 if attitude is None else attitude.arrived_ns
+
 
 class Sample(NamedTuple):
     """One reading, passed from the guard to the flight process."""

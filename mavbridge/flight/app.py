@@ -192,7 +192,7 @@ class _Flight:
             view=self._view,
             caches=caches,
             send=guard.send,
-            watch=self._observers.watch_solve,
+            watches=[each.emit for each in self._observers.recorders],
         )
 
     def _close_recorder(self) -> None:

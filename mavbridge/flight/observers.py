@@ -21,7 +21,7 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.records import FlightOutcome, Solve, TickSink
+from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.guard_process import GuardProcess
@@ -78,22 +78,9 @@ class FlightObservers:
         return (self._timing, self.screen, self.referee, *self.recorders)
 
     @property
-    def recorders(self) -> tuple[TickSink, ...]:
-        """Observers that take the images of all cameras."""
+    def recorders(self) -> tuple[ObserverThread, ...]:
+        """Observers that take every solve, and the images of all cameras."""
         return tuple(sink for sink in (self._recorder, self._viewer) if sink is not None)
-
-    @property
-    def watch_solve(self) -> Callable[[Solve], object] | None:
-        """Callback for every solve; None if no observer takes solves."""
-        takers = [taker for taker in (self._recorder, self._viewer) if taker is not None]
-        if not takers:
-            return None
-
-        def watch(solve: Solve) -> None:
-            for taker in takers:
-                taker.emit(solve)
-
-        return watch
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Pass the vehicle's packets to the recorder, if there is one."""

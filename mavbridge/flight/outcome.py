@@ -5,7 +5,6 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, CourseProgress
@@ -194,14 +193,6 @@ def describe(outcome: FlightOutcome) -> str:
     return f"{text}: {outcome.reason}" if is_told else text
 
 
-class Verdict(NamedTuple):
-    """Exit status of a flight, with its reason."""
-
-    exit_code: int
-    text: str | None = None
-    """Why the status is not 0."""
-
-
 def flight_verdict(
     summary: GuardSummary | None,
     stop: StopRequest,
@@ -210,8 +201,8 @@ def flight_verdict(
     readonly: bool,
     crash: str | None = None,
     record: Path | None = None,
-) -> Verdict:
-    """Judge a flight that ended without an exception.
+) -> tuple[int, str | None]:
+    """Return the exit status of a flight that ended without an exception, and why it is not 0.
 
     Args:
         summary: the guard's last words; None where it goes on without us.
@@ -223,26 +214,26 @@ def flight_verdict(
     """
     interrupted = None if stop.signal_number is None else 128 + stop.signal_number
     if summary is None:
-        return Verdict(interrupted or ExitCode.NOT_FLOWN)
+        return interrupted or ExitCode.NOT_FLOWN, None
     outcome = summary.outcome
     if outcome.faults:
         shown = f"; see it with: mavbridge inspect {shlex.quote(str(record))}" if record else ""
         fault = f"the policy's flight was ended by a fault: {outcome.fault}{shown}"
-        return Verdict(ExitCode.FAULT, fault)
+        return ExitCode.FAULT, fault
     if crash is not None and not readonly:
-        return Verdict(ExitCode.CRASHED, f"the vehicle has crashed: {crash}")
+        return ExitCode.CRASHED, f"the vehicle has crashed: {crash}"
     if readonly and outcome.flights:
-        return Verdict(ExitCode.DONE)
+        return ExitCode.DONE, None
     if not outcome.flights:
         why = f": {reason}" if reason else ""
-        return Verdict(interrupted or ExitCode.NOT_FLOWN, f"the policy has not flown{why}")
+        return interrupted or ExitCode.NOT_FLOWN, f"the policy has not flown{why}"
     if outcome.has_left_ground is False:
         code = interrupted or ExitCode.NOT_FLOWN
-        return Verdict(code, "the vehicle has not left the ground")
+        return code, "the vehicle has not left the ground"
     if outcome.is_disarmed:
         text = "the vehicle was disarmed, or restarted, while the policy flew it"
-        return Verdict(ExitCode.NOT_FLOWN, text)
-    return Verdict(ExitCode.DONE)
+        return ExitCode.NOT_FLOWN, text
+    return ExitCode.DONE, None
 
 
 def log_link(summary: GuardSummary) -> None:

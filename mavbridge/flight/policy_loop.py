@@ -13,7 +13,7 @@ from mavbridge.core.records import FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import Telemetry
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.forward_state import ForwardState
+from mavbridge.flight.forward_state import rolled_forward
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.state import (
@@ -26,6 +26,7 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from policy.errors import NoChunkError
+from policy.motion.forward_motion import ForwardMotion
 from policy.protocol import PolicyRunner
 
 WAIT_NS = 100 * NS_PER_MS
@@ -55,11 +56,11 @@ class PolicyLoop:
         view: TelemetryCache,
         caches: Sequence[FeatureCache],
         send: Callable[[Chunk | Reason], object],
-        watch: Callable[[Solve], object] | None = None,
+        watches: Sequence[Callable[[Solve], object]] = (),
     ) -> None:
         """Join a policy, telemetry and the caches of its cameras, in the contract's order.
 
-        ``send`` hands a chunk to the guard, or the reason why there is none; ``watch`` is given
+        ``send`` hands a chunk to the guard, or the reason why there is none; ``watches`` are given
         every solve, and must not block.
         """
         contract = plan.contract
@@ -70,7 +71,7 @@ class PolicyLoop:
             contract, caches=caches, join=runner.join, max_age_ns=plan.start_limits.feature_ns
         )
         self._send = send
-        self._watch = watch
+        self._watches = watches
         self._action_frame = action_frame(contract)
         self._guard = plan.guard
         self._step_ns = round(contract.chunk_dt_s * NS_PER_S)
@@ -78,7 +79,7 @@ class PolicyLoop:
         self._period_ns = plan.guard.chunk_period_ns
         """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
         one."""
-        self._forward = ForwardState(contract) if contract.state_time == "execution" else None
+        self._forward = ForwardMotion(contract) if contract.state_time == "execution" else None
         """Predicts the state to the time at which the chunk acts."""
         self._before_ns = observation_ages_ns(contract)
         self._frozen = FrozenStateCheck(
@@ -137,14 +138,13 @@ class PolicyLoop:
     @property
     def has_news(self) -> bool:
         """True if an attitude has arrived that starts the next solve."""
-        return self._view.attitude_ns >= self.start_ns
+        return self._view.telemetry.attitude_ns >= self.start_ns
 
     def step(self) -> None:
         """Solve once from the newest inputs, or tell the guard why that is impossible."""
         now_ns, is_starting = self._clock.now_ns(), self._is_starting
         telemetry, has_position = self._view.telemetry, self._view.status.has_position
-        attitude = telemetry.ned_from_body_wxyz
-        self._seen_ns = 0 if attitude is None else attitude.arrived_ns
+        self._seen_ns = telemetry.attitude_ns
         due_ns = now_ns if self._due_ns is None or is_starting else self._due_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
         self._due_ns = max(due_ns, now_ns - self._period_ns // 2) + self._period_ns * 99 // 100
@@ -152,7 +152,9 @@ class PolicyLoop:
             self._reset_ns = now_ns
             self._runner.reset()
         for past in self._view.take_past(self._seen_ns):
-            if (before := self._view.reader.past(past, has_position=has_position)) is not None:
+            arrived_ns = past.attitude_ns
+            before = self._view.reader.read(past, arrived_ns, has_position=has_position)
+            if isinstance(before, VehicleState):
                 self._observations.push(before)
         state = self._view.reader.read(telemetry, now_ns, has_position=has_position)
         if isinstance(state, Reason):
@@ -180,7 +182,7 @@ class PolicyLoop:
             acts_ns = self._takeover_ns(now_ns)
             for before_ns in self._before_ns:
                 at_ns = acts_ns - before_ns
-                then = self._forward.at(telemetry, at_ns, ahead.at)
+                then = rolled_forward(self._forward, telemetry, at_ns, ahead.at)
                 if then is telemetry:  # measured by then, or the vehicle stands still
                     continue
                 has_position = self._view.status.has_position
@@ -252,8 +254,8 @@ class PolicyLoop:
         self._view.remember(solve, observation.captured_ns)
         self._chunk = chunk_of(solve, self._action_frame)
         self._send(self._chunk)
-        if self._watch is not None:
-            self._watch(solve)
+        for watch in self._watches:
+            watch(solve)
 
 
 def chunk_of(solve: Solve, frame: ActionFrame) -> Chunk:

@@ -126,14 +126,6 @@ class StateReader:
                 numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
 
-    def past(self, telemetry: Telemetry, *, has_position: bool) -> VehicleState | None:
-        """Return the state at the arrival of the newest attitude; None if it is unavailable."""
-        attitude = telemetry.ned_from_body_wxyz
-        if attitude is None:
-            return None
-        state = self.read(telemetry, attitude.arrived_ns, has_position=has_position)
-        return state if isinstance(state, VehicleState) else None
-
     def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Reason:
         what = _READINGS[extra]
         if reading is None:

@@ -108,15 +108,10 @@ class TelemetryCache:
         """True if the policy flies and the vehicle reports that it is not landed."""
         return self.phase is Phase.FLYING and self.status.is_landed is False
 
-    @property
-    def attitude_ns(self) -> int:
-        """Arrival of the newest attitude; 0 before the first."""
-        return _attitude_ns(self.telemetry)
-
     def take_past(self, until_ns: int) -> list[Telemetry]:
         """Return the telemetry at each attitude since the last call, up to arrival ``until_ns``."""
         taken: list[Telemetry] = []
-        while self._past and _attitude_ns(self._past[0]) <= until_ns:
+        while self._past and self._past[0].attitude_ns <= until_ns:
             taken.append(self._past.popleft())
         return taken
 
@@ -130,7 +125,7 @@ class TelemetryCache:
             while True:
                 for data in port.receive():
                     self._receive_samples(decode_samples(data))
-                if self.attitude_ns > newer_than_ns:
+                if self.telemetry.attitude_ns > newer_than_ns:
                     return True
                 if (left_ns := until_ns - clock.now_ns()) <= 0:
                     return False
@@ -174,9 +169,9 @@ class TelemetryCache:
             self.telemetry = self.telemetry._replace(**dict(samples))
             return
         for _, datagram in groupby(samples, key=lambda sample: sample.reading.arrived_ns):
-            known_ns, self.telemetry = self.attitude_ns, self.telemetry._replace(**dict(datagram))
+            known, self.telemetry = self.telemetry, self.telemetry._replace(**dict(datagram))
             # After each datagram: which of them came in one batch is not in a recording.
-            if self.attitude_ns != known_ns:
+            if self.telemetry.attitude_ns != known.attitude_ns:
                 self._past.append(self.telemetry)
 
     def _receive_tick(self, tick: GuardTick) -> None:
@@ -221,8 +216,3 @@ class TelemetryCache:
             position_ned_m=Position(*position.values) if position and is_placed else None,
             readonly=self._readonly,
         )
-
-
-def _attitude_ns(telemetry: Telemetry) -> int:
-    attitude = telemetry.ned_from_body_wxyz
-    return 0 if attitude is None else attitude.arrived_ns

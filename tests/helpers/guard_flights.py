@@ -133,7 +133,7 @@ class GuardFlight:
             view=self.view,
             caches=[self.features],
             send=self._send,
-            watch=self.solves.append,
+            watches=[self.solves.append],
         )
         self.tell(plan.guard)
         receive = flight_process(self.clock, self._policy_clock, self._port, policy, self.view)

@@ -146,7 +146,7 @@ def flown_and_paired(
 
     parts = {
         "vision_loops": recorded,
-        "PolicyLoop": partial(PolicyLoop, watch=flown.solves.append),
+        "PolicyLoop": partial(PolicyLoop, watches=[flown.solves.append]),
         "TelemetryCache": partial(TelemetryCache, watch_packets=flown.packets.extend),
     }
     for name, part in parts.items():

@@ -94,7 +94,7 @@ class _Loop:
             view=self.view,
             caches=self.caches,
             send=self._sent,
-            watch=self._keep,
+            watches=[self._keep],
         )
         autopilot = source.meta.autopilot or "none"
         self.view.receive(GuardStatus(autopilot, None, True, None, (), None, has_position=True))

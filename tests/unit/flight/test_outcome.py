@@ -83,26 +83,28 @@ def test_the_status_says_what_a_script_needs(
     outcome: Outcome | None, number: int | None, crash: str | None, status: int, told: str | None
 ) -> None:
     words = None if outcome is None else summary(outcome)
-    verdict = flight_verdict(words, stopped(number), reason=NO_CHUNK, readonly=False, crash=crash)
-    assert verdict.exit_code == status
-    assert (told or "") in (verdict.text or "")
-    assert (told is None) == (verdict.text is None)
+    exit_code, text = flight_verdict(
+        words, stopped(number), reason=NO_CHUNK, readonly=False, crash=crash
+    )
+    assert exit_code == status
+    assert (told or "") in (text or "")
+    assert (told is None) == (text is None)
 
 
 @pytest.mark.parametrize("record", [None, Path("flights/a b")])
 def test_a_fault_is_told_with_its_cause_and_the_command_that_shows_it(record: Path | None) -> None:
     old = because(Code.TOO_OLD, quantity="attitude", age_ms=104.0, limit_ms=100.0)
     words = summary(FLOWN._replace(faults=1, fault=old))
-    told = flight_verdict(words, stopped(None), reason=None, readonly=False, record=record).text
+    _, told = flight_verdict(words, stopped(None), reason=None, readonly=False, record=record)
     end = "" if record is None else "; see it with: mavbridge inspect 'flights/a b'"
     assert (told or "").endswith(f": {old}{end}")
 
 
 def test_a_flight_that_sends_nothing_needs_no_air() -> None:
     watched = summary(Outcome(flights=1, has_left_ground=False))
-    assert flight_verdict(watched, stopped(None), reason=None, readonly=True).exit_code == 0
+    assert flight_verdict(watched, stopped(None), reason=None, readonly=True)[0] == 0
     unseen = summary(Outcome())
-    assert flight_verdict(unseen, stopped(None), reason=None, readonly=True).exit_code == 3
+    assert flight_verdict(unseen, stopped(None), reason=None, readonly=True)[0] == 3
 
 
 GATES = [CourseGate(Position(north, 0.0, -2.0), 0.0, 2.4) for north in (4.0, 8.0)]

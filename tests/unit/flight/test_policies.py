@@ -9,15 +9,16 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.flight.policies import (
-    check_configured_policy,
     load_configured_policy,
     load_for_episodes,
     looks_at_images,
     policy_files,
+    policy_request,
     require_cameras,
     require_images,
 )
 from policy.engines.runner import dummy_sample, encode_all
+from policy.loading.load import check_request
 
 MINE = """
 import numpy as np
@@ -73,7 +74,7 @@ def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     wanted = PolicyConfig(policy="still_module:Still")
-    check_configured_policy(wanted)
+    check_request(policy_request(wanted))
     assert load_configured_policy(wanted, MonotonicClock()).runner.name == wanted.policy
 
 
