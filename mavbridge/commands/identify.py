@@ -22,10 +22,11 @@ from mavbridge.core.vehicle import Action
 from mavbridge.flight.app import fly_policy
 from mavbridge.flight.checks import check_flight, output_folders
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.policies import configured_contract
+from mavbridge.flight.policies import policy_request
 from mavbridge.observe.output import patient_console
 from policy.contract import RATE, STICK_TERMS, ActionKind, Contract, FloatArray
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
+from policy.loading.load import read_policy_contract
 from policy.motion.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps, measure
 from policy.motion.scripted import ScriptedPolicy
 from policy.motion.stick_loop import motion_of_sticks
@@ -346,7 +347,7 @@ def as_document(
 def identify(config: IdentifyConfig) -> int:
     """Fly the doublet, and print how the vehicle's gains and lags compare with the policy's."""
     clock = MonotonicClock()
-    trained = configured_contract(config.flight.policy)
+    trained = read_policy_contract(policy_request(config.flight.policy))
     flight = doublet_flight(config, trained)
     require_writable(config.json, "--json")
     recording = ResponseRecording()

@@ -29,7 +29,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, is_stateless, load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of
@@ -79,7 +79,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     steps = replay_guard(source)
     flown = replace(source, config=wanted)
     plan, engine = recorded_plan(flown), source.meta.engine or ""
-    frame = action_frame(source.contract)
+    frame = ActionFrame(source.contract)
     chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
     compared: PolicyComparison | None = None
     if chosen != "chunks":
@@ -93,7 +93,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         # The new chunks, by the serial numbers of the recorded ones.
         chunks = {
             pair.recorded.serial: chunk_of(
-                replace(pair.replayed, serial=pair.recorded.serial), action_frame(runner.contract)
+                replace(pair.replayed, serial=pair.recorded.serial), ActionFrame(runner.contract)
             )
             for pair in pairs
             if pair.replayed is not None

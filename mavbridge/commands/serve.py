@@ -25,7 +25,7 @@ from mavbridge.core.address import is_local, spelled
 from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import stop_signals
-from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+from mavbridge.flight.policies import load_configured_policy, policy_request
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.terminal import MessageScreen
 from policy.adapters.interface import Interface
@@ -39,6 +39,7 @@ from policy.adapters.websocket.messages import (
 )
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY, API_KEY_VARIABLE
 from policy.errors import PolicyError
+from policy.loading.load import check_request
 from policy.protocol import PolicyRunner, keep_nothing
 
 MAX_CLIENTS = 4
@@ -175,7 +176,7 @@ def _name(connection: ServerConnection) -> str:
 def serve(config: ServeConfig) -> int:
     """Serve a policy until a signal comes."""
     policy_config = replace(config.policy, dual_rate=False)
-    check_configured_policy(policy_config)
+    check_request(policy_request(policy_config))
     screen, clock = MessageScreen(patient_console(stderr=False)), MonotonicClock()
     with ExitStack() as stack:
         loaded = stack.enter_context(load_configured_policy(policy_config, clock))

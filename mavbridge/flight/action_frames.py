@@ -6,53 +6,48 @@ conversion is its own inverse.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import ACTION_CLASSES, NEUTRAL, Action
+from mavbridge.core.vehicle import ACTION_CLASSES, Action
 from policy.contract import Contract
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ActionFrame:
-    """Kind of the policy's actions, and the permutation and signs that convert them to NED and
-    FRD."""
+    """Kind and axes of a policy's actions; converts them to NED and FRD, and back."""
 
-    neutral: Action = NEUTRAL
-    """Neutral action of the policy's kind: zeros, or zeros with hover thrust. Equal in both
-    frames."""
-    order: tuple[int, ...] = (0, 1, 2, 3)
-    signs: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
-    """Component ``i`` in one frame is ``signs[i]`` times component ``order[i]`` in the other."""
+    def __init__(self, contract: Contract) -> None:
+        thrust = contract.hover_thrust if contract.action in ("rates", "attitude") else 0.0
+        self.neutral: Action = ACTION_CLASSES[contract.action](thrust, 0.0, 0.0, 0.0)
+        """Zeros, or zeros with hover thrust. Equal in both frames."""
+        self._axes = _other_axes(contract)
 
     def to_guard(self, actions: FloatArray) -> tuple[Action, ...]:
         """Convert policy actions [horizon, 4] to NED and FRD actions."""
         kind = type(self.neutral)
-        return tuple(map(kind._make, self._other_axes(actions).tolist()))
+        return tuple(map(kind._make, self._converted(actions).tolist()))
 
     def from_guard(self, actions: Sequence[Action]) -> FloatArray:
         """Convert sent actions of the policy's kind to its frame, [len, 4]."""
-        return self._other_axes(np.array(actions, dtype=np.float32))
+        return self._converted(np.array(actions, dtype=np.float32))
 
-    def _other_axes(self, actions: FloatArray) -> FloatArray:
-        if self.order == (0, 1, 2, 3) and self.signs == (1.0, 1.0, 1.0, 1.0):
+    def _converted(self, actions: FloatArray) -> FloatArray:
+        if self._axes is None:
             return actions
-        return actions[:, self.order] * np.array(self.signs, dtype=np.float32)
+        order, signs = self._axes
+        return actions[:, order] * np.array(signs, dtype=np.float32)
 
 
-def action_frame(contract: Contract) -> ActionFrame:
-    """Return the frame conversion and action kind of a contract."""
+def _other_axes(contract: Contract) -> tuple[tuple[int, ...], tuple[float, ...]] | None:
+    """Return order and signs of the conversion: component ``i`` in one frame is ``signs[i]`` times
+    component ``order[i]`` in the other. None: the frames are the same."""
     kind = contract.action
-    cls = ACTION_CLASSES[kind]
-    has_thrust = kind in ("rates", "attitude")
-    neutral = cls(contract.hover_thrust, 0.0, 0.0, 0.0) if has_thrust else cls(0.0, 0.0, 0.0, 0.0)
     if contract.state_frame == "ned_frd" or kind == "sticks":
-        return ActionFrame(neutral=neutral)
+        return None
     if kind == "velocity" and contract.velocity_frame == "world":
         # East, north, up, left turn <-> north, east, down, right turn.
-        return ActionFrame(neutral=neutral, order=(1, 0, 2, 3), signs=(1.0, 1.0, -1.0, -1.0))
+        return (1, 0, 2, 3), (1.0, 1.0, -1.0, -1.0)
     if kind == "velocity":  # forward, left, up <-> forward, right, down
-        return ActionFrame(neutral=neutral, signs=(1.0, -1.0, -1.0, -1.0))
-    return ActionFrame(neutral=neutral, signs=(1.0, 1.0, -1.0, -1.0))
+        return (0, 1, 2, 3), (1.0, -1.0, -1.0, -1.0)
+    return (0, 1, 2, 3), (1.0, 1.0, -1.0, -1.0)

@@ -9,9 +9,10 @@ from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.address import is_reachable, parse_address
 from mavbridge.core.course import read_gates
 from mavbridge.core.files import require_writable
-from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
+from mavbridge.flight.policies import policy_request, require_cameras, require_images
 from mavbridge.observe.viewer_target import check_target
 from mavbridge.recording.folder import prepare_folder
+from policy.loading.load import check_request
 
 
 def signing_note(config: LinkConfig) -> str | None:
@@ -34,7 +35,7 @@ def check_flight(config: FlyConfig) -> None:
     parse_address(config.link.connect)
     for source in config.camera.sources:
         check_camera(source, latency_ms=config.camera.camera_latency)
-    check_configured_policy(config.policy)
+    check_request(policy_request(config.policy))
     require_images(config)
     for _name, _value, check in file_checks(config):
         check()

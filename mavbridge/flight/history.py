@@ -14,7 +14,7 @@ from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.limits import ActionSmoother
 from mavbridge.guard.settings import FlightSettings
-from policy.contract import history_ages_ns
+from policy.contract import Contract, history_ages_ns
 
 REPORTED_NS = 10 * NS_PER_MS
 """Age of a sent action from which the guard has reported it, in flight as in a replay."""
@@ -26,11 +26,10 @@ class SentHistory:
     One thread may append while another one resamples.
     """
 
-    def __init__(self, *, length: int, dt_s: float, frame: ActionFrame | None = None) -> None:
-        """Create a neutral history. ``frame``: kind and axes of the policy's actions; None:
-        sticks."""
-        self._frame = frame or ActionFrame()
-        self._ages_ns = history_ages_ns(length, dt_s)
+    def __init__(self, contract: Contract) -> None:
+        """Create a neutral history of the policy's kind of actions."""
+        self._frame = ActionFrame(contract)
+        self._ages_ns = history_ages_ns(contract.history_len, contract.history_dt_s)
         self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
         self._lock = threading.Lock()
         self._sent_ns: list[int] = []

@@ -23,7 +23,7 @@ from mavbridge.core.provenance import (
 )
 from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.outcome import FlightReferee, describe
 from mavbridge.flight.plan import FlightPlan
@@ -102,7 +102,7 @@ class FlightObservers:
             contract=contract,
             max_state_age_ns=freshness.state_ns,
             max_feature_age_ns=freshness.feature_ns,
-            to_ned=action_frame(contract).to_guard,
+            to_ned=ActionFrame(contract).to_guard,
             gates=self._gates or (),
         )
         viewer = ObserverThread(

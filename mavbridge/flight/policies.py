@@ -13,10 +13,9 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
 from policy.adapters.description import DESCRIPTION
-from policy.contract import Contract
 from policy.files import CONTRACT_FILE, user_path
 from policy.loading.builtin import shipped_weights
-from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.load import load_policy
 from policy.loading.request import LoadedPolicy, PolicyRequest
 from policy.nets.names import BUILTIN_KINDS
 
@@ -40,23 +39,12 @@ def load_configured_policy(
     Raises:
         PolicyError: it cannot be loaded.
     """
-    request = replace(_request(wanted), starts_in_air=starts_in_air)
+    request = replace(policy_request(wanted), starts_in_air=starts_in_air)
     return load_policy(request, now_s=lambda: clock.now_ns() / NS_PER_S)
 
 
-def check_configured_policy(wanted: PolicyConfig) -> None:
-    """Raise PolicyError, within milliseconds, if ``load_configured_policy`` could not load the
-    policy."""
-    check_request(_request(wanted))
-
-
-def configured_contract(wanted: PolicyConfig) -> Contract:
-    """Return the contract of the named policy without loading its weights; raise PolicyError if it
-    has none."""
-    return read_policy_contract(_request(wanted))
-
-
-def _request(wanted: PolicyConfig) -> PolicyRequest:
+def policy_request(wanted: PolicyConfig) -> PolicyRequest:
+    """Return the request for the policy that the flags name."""
     return PolicyRequest(
         spec=wanted.policy,
         checkpoint=wanted.checkpoint,

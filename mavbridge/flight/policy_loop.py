@@ -11,7 +11,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import Telemetry
-from mavbridge.flight.action_frames import ActionFrame, action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.forward_state import rolled_forward
 from mavbridge.flight.history import SentHistory
@@ -72,7 +72,7 @@ class PolicyLoop:
         )
         self._send = send
         self._watches = watches
-        self._action_frame = action_frame(contract)
+        self._action_frame = ActionFrame(contract)
         self._guard = plan.guard
         self._step_ns = round(contract.chunk_dt_s * NS_PER_S)
         self._prefix_len = contract.prefix_len

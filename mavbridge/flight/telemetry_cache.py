@@ -14,7 +14,6 @@ from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Position, Solve, Tick, TickSink, VehicleState
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
-from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.state import StateReader, keeps_past
@@ -64,10 +63,7 @@ class TelemetryCache:
                 waits for an attitude reads them itself, so that no other one has to wake it.
             watch_packets: is given packets for a recorder, in the same thread; must not block.
         """
-        contract = plan.contract
-        self.history = SentHistory(
-            length=contract.history_len, dt_s=contract.history_dt_s, frame=action_frame(contract)
-        )
+        self.history = SentHistory(plan.contract)
         """Every action that was sent."""
         self.reader = StateReader(plan)
         self._sink, self._readonly = sink, plan.config.link.readonly

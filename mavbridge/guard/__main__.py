@@ -103,7 +103,6 @@ def _run(
         link.close()
     engagement = loop.guard.engagement if loop.guard else None
     summary = GuardSummary(
-        autopilot=link.autopilot,
         link=link.stats(),
         failure=engagement.failure if engagement else None,
         outcome=engagement.outcome if engagement else Outcome(),

@@ -95,7 +95,6 @@ class GuardDiedError(MavbridgeError):
 class GuardSummary:
     """Last message of a guard that ends normally."""
 
-    autopilot: str
     link: LinkStats
     failure: Reason | None
     """Why there was no flight, or None."""

@@ -15,7 +15,7 @@ from mavbridge.commands.replay import CLOCK_TOLERANCE, ENGINE_TOLERANCE
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.simulation.clock import SteppedClock
@@ -110,7 +110,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
     assert compared.missing == {}
     assert compared.inputs_differ == {}
     chunks = {
-        pair.recorded.serial: chunk_of(pair.replayed, action_frame(source.contract))
+        pair.recorded.serial: chunk_of(pair.replayed, ActionFrame(source.contract))
         for pair in pairs
         if pair.replayed is not None
     }
@@ -132,7 +132,7 @@ def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     source, steps = golden(name), through_gate(name)
-    frame = action_frame(source.contract)
+    frame = ActionFrame(source.contract)
     chunks = {solve.serial: chunk_of(solve, frame) for solve in source.solves}
 
     traces = stick_traces(steps, replay_other(steps, recorded_plan(source).guard, chunks))

@@ -16,7 +16,7 @@ from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FeatureFrame, Solve, Tick, TickSink, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.policy_loop import PolicyLoop, chunk_of
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.values import Phase
@@ -291,7 +291,7 @@ def test_a_mode_that_is_entered_before_the_slot_after_its_request_is_no_takeover
     steps = replay_guard(source)
     assert compare_guard(steps).differ == {}
     chunks = {
-        solve.serial: chunk_of(solve, action_frame(source.contract)) for solve in source.solves
+        solve.serial: chunk_of(solve, ActionFrame(source.contract)) for solve in source.solves
     }
     ticks = replay_other(steps, recorded_plan(source).guard, chunks)
     assert [tick.phase.value for tick in ticks] == [tick.phase for tick in source.ticks]

@@ -117,14 +117,13 @@ class ObservationQueue:
     """
 
     def __init__(self, start: RolloutStart, sampler: Sampler, decider: "Decider") -> None:
-        contract = decider.contract
         self._latents = deque(sampler.encode(start.images), maxlen=len(start.images))
         self._states = deque(start.states, maxlen=len(start.states))
         self.images: deque[ImageArray] = deque(start.images, maxlen=decider.images)
         self._step_ns = round(sampler.config.frame_dt_s * NS_PER_S)
         self.now_ns = start.newest_ns
         """Exposure of the newest frame, on the flight's clock."""
-        self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
+        self._history = SentHistory(decider.contract)
         for at_ns, sticks in start.sent:
             self._history.append(sticks, at_ns)
 

@@ -22,7 +22,7 @@ from mavbridge.commands.output import print_status, table_console, write_json
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import Observed, Tick, VisionTick
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.terminal import BAD, Finding, number, timing_table
 from mavbridge.observe.timing import report_document
@@ -206,7 +206,7 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             contract=contract,
             max_state_age_ns=limits.state_ns,
             max_feature_age_ns=limits.feature_ns,
-            to_ned=action_frame(contract).to_guard,
+            to_ned=ActionFrame(contract).to_guard,
             gates=flight.gates,
         ),
     )

@@ -18,7 +18,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.ticks import GuardTick
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.settings import link_settings
@@ -180,7 +180,7 @@ def _arrivals(
     A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve,
     but the first one that flies only from its tick on: it may have been on its way before.
     """
-    frame, solves = action_frame(source.contract), iter(source.solves)
+    frame, solves = ActionFrame(source.contract), iter(source.solves)
     waiting = next(solves, None)
     before: Tick | None = None
     for tick, after in zip_longest(source.ticks, source.ticks[1:]):

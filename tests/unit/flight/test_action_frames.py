@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mavbridge.core.vehicle import Action, AttitudeThrust, BodyRates, Sticks, Velocity
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from policy.contract import ActionKind, Contract, VelocityFrame
 
 FOUR = np.array([[0.5, 1.0, 2.0, 3.0], [0.25, -4.0, 5.0, -6.0]], np.float32)
@@ -23,9 +23,7 @@ FOUR = np.array([[0.5, 1.0, 2.0, 3.0], [0.25, -4.0, 5.0, -6.0]], np.float32)
 def test_actions_in_ros_axes_by_hand_and_back(
     kind: ActionKind, velocity_frame: VelocityFrame, expected: Action
 ) -> None:
-    frame = action_frame(
-        Contract(action=kind, velocity_frame=velocity_frame, state_frame="enu_flu")
-    )
+    frame = ActionFrame(Contract(action=kind, velocity_frame=velocity_frame, state_frame="enu_flu"))
     sent = frame.to_guard(FOUR)
     assert type(sent[0]) is type(expected)
     assert sent[0] == expected
@@ -34,7 +32,7 @@ def test_actions_in_ros_axes_by_hand_and_back(
 
 def test_neutral_hovers_by_the_contracts_thrust() -> None:
     for kind, thrust in (("sticks", 0.0), ("velocity", 0.0), ("rates", 0.45), ("attitude", 0.45)):
-        frame = action_frame(Contract(action=kind, hover_thrust=0.45))
+        frame = ActionFrame(Contract(action=kind, hover_thrust=0.45))
         assert frame.neutral == (thrust, 0.0, 0.0, 0.0)
         np.testing.assert_array_equal(
             frame.from_guard([frame.neutral]), np.array([[thrust, 0, 0, 0]], np.float32)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -5,7 +7,6 @@ from helpers.factories import make_plan
 from helpers.guard_facts import make_chunk
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import IDLE, NEUTRAL, AttitudeThrust, BodyRates, Sticks, Velocity
-from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.history import SentHistory
 from mavbridge.guard.limits import ActionSmoother
 from policy.contract import Contract
@@ -17,7 +18,7 @@ def stick(value: float) -> Sticks:
 
 @pytest.mark.parametrize("tick_ms", [5, 10, 20])
 def test_history_is_the_same_at_any_rate(tick_ms: int) -> None:
-    history = SentHistory(length=3, dt_s=0.02)
+    history = SentHistory(Contract(history_len=3, history_dt_s=0.02))
     for at_ms in range(0, 200 + 1, tick_ms):
         history.append(stick(at_ms / 1000), at_ms * NS_PER_MS)
     now = history.resample(200 * NS_PER_MS)
@@ -26,7 +27,7 @@ def test_history_is_the_same_at_any_rate(tick_ms: int) -> None:
 
 
 def test_what_was_never_sent_and_what_was_released_is_neutral() -> None:
-    history = SentHistory(length=4, dt_s=0.01)
+    history = SentHistory(Contract(history_len=4, history_dt_s=0.01))
     assert not history.resample(0).any()
     history.append(stick(0.5), 0)
     history.append(None, 15 * NS_PER_MS)
@@ -36,8 +37,8 @@ def test_what_was_never_sent_and_what_was_released_is_neutral() -> None:
 
 
 def test_what_was_sent_comes_back_in_the_policys_own_axes_and_kind() -> None:
-    contract = Contract(action="rates", state_frame="enu_flu", hover_thrust=0.5)
-    history = SentHistory(length=4, dt_s=0.01, frame=action_frame(contract))
+    own_terms = Contract(action="rates", state_frame="enu_flu", hover_thrust=0.5)
+    history = SentHistory(replace(own_terms, history_len=4, history_dt_s=0.01))
     neutral = [0.5, 0, 0, 0]
     assert history.resample(0)[0].tolist() == [neutral] * 4
     history.append(BodyRates(0.25, 1.0, 2.0, -3.0), 0)
@@ -51,7 +52,7 @@ def test_what_was_sent_comes_back_in_the_policys_own_axes_and_kind() -> None:
 def test_what_is_foreseen_is_what_the_guard_will_send_and_what_was_sent_stays() -> None:
     """Neither the 12 m/s of the plan, nor without the limit on its change."""
     guard = make_plan(Contract(action="velocity")).guard
-    history = SentHistory(length=4, dt_s=0.05, frame=action_frame(Contract(action="velocity")))
+    history = SentHistory(Contract(action="velocity", history_len=4, history_dt_s=0.05))
     history.append(Velocity(1.0, 0.0, 0.0, 0.0), 0)
     plan = make_chunk(1, 0, first_ns=0, actions=(Velocity(12.0, 0.0, 0.0, 0.0),))
     smoother, sent = ActionSmoother(guard.smoothing, Velocity(1.0, 0.0, 0.0, 0.0)), []
@@ -68,7 +69,7 @@ def test_what_is_foreseen_is_what_the_guard_will_send_and_what_was_sent_stays() 
 
 
 def test_history_forgets_what_no_resample_can_reach() -> None:
-    history = SentHistory(length=4, dt_s=0.05)
+    history = SentHistory(Contract(history_len=4, history_dt_s=0.05))
     for tick in range(100_000):
         history.append(stick(0.0), tick * 10 * NS_PER_MS)
     assert len(history._sent) <= 27

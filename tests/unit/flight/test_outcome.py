@@ -41,7 +41,6 @@ STATS = LinkStats(
 
 def summary(outcome: Outcome) -> GuardSummary:
     return GuardSummary(
-        autopilot="ArduPilot",
         link=STATS,
         failure=None,
         outcome=outcome,

@@ -23,7 +23,7 @@ from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Observed, Position
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
-from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.observe.viewer import EVENT_CHARACTERS, RerunView, layout
 from mavbridge.observe.viewer_layout import ViewedFlight, flight_blueprint, styles
 from policy.contract import Contract
@@ -82,7 +82,7 @@ def viewed(contract: Contract | None = None, gates: tuple[CourseGate, ...] = ())
         contract=contract,
         max_state_age_ns=100_000_000,
         max_feature_age_ns=300_000_000,
-        to_ned=action_frame(contract).to_guard,
+        to_ned=ActionFrame(contract).to_guard,
         gates=gates,
     )
 

@@ -58,7 +58,7 @@ def timeline(*episodes: FlightData, contract: Contract = CONTRACT) -> Timeline:
 def test_history_is_what_the_runtime_resamples() -> None:
     episode = flown(ticks=60)
     made = timeline(flown(seed=1), episode).histories(np.arange(200, 260))
-    runtime = SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s)
+    runtime = SentHistory(CONTRACT)
     for tick in range(60):
         expected = runtime.resample(int(episode.tick_ns[tick]))
         np.testing.assert_array_equal(made[tick], expected[0])
