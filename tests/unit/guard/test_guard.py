@@ -35,7 +35,7 @@ from mavbridge.core.vehicle import (
     Telemetry,
     Velocity,
 )
-from mavbridge.guard.chunks import Chunk, FreshnessLimits, late
+from mavbridge.guard.chunks import MAX_REFUSED, Chunk, FreshnessLimits, late
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
@@ -387,6 +387,17 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
         guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
     assert guard.guard.engagement.outcome.faults == 1
     assert because(Code.BATTERY) in [o.tick.release_reason for o in guard.outputs]
+
+
+def test_a_command_that_fails_and_chunks_that_cannot_be_used_end_a_flight() -> None:
+    guard = Stepped().engaged()
+    failed = guard.step(40, guard.chunk(40), fault=because(Code.COMMAND_FAILED))
+    assert failed.tick.release_reason == because(Code.COMMAND_FAILED)
+    guard = Stepped().engaged()
+    bad = WANTED._replace(roll=math.nan)
+    for at_ms in range(40, 40 + MAX_REFUSED):  # within the grace
+        last = guard.step(at_ms, guard.chunk(at_ms, bad))
+    assert codes(last.tick.release_reason)[0] is Code.UNUSABLE_CHUNKS
 
 
 def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
