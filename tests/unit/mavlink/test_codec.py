@@ -265,6 +265,14 @@ def test_a_packet_is_not_completed_by_another_sender() -> None:
     assert isinstance(incoming.body, Heartbeat)
 
 
+def test_unfinished_packets_of_the_newest_16_senders_are_kept() -> None:
+    ours, data = codec(), WireEnd().heartbeat()
+    for sender in range(17):
+        assert list(ours.decode_datagram(data[:9], ("sender", sender))) == []
+    read = [len(list(ours.decode_datagram(data[9:], ("sender", each)))) for each in range(17)]
+    assert read == [0, *[1] * 16]
+
+
 def test_a_datagram_is_read_to_its_limit_and_what_is_lost_counts_once() -> None:
     heartbeat = WireEnd().pack(m.heartbeat_encode(2, 3, 0, 0, 4))
     whole = heartbeat * (MOST_DATAGRAM_BYTES // len(heartbeat))
@@ -496,6 +504,11 @@ def test_a_parameter_that_is_no_integer_is_written_as_it_is() -> None:
     assert ParamValue("COM_RC_LOSS_T", 0.5, 9).from_bytes().value == 0.5
     too_much = ParamWrite("SYS_AUTOSTART", 1e12, kind=6).as_bytes()
     assert ParamValue("SYS_AUTOSTART", too_much.value, 6).from_bytes().value == 2**31 - 1
+
+
+def test_packets_are_numbered_in_one_byte() -> None:
+    ours = codec()
+    assert [ours.encode_heartbeat()[4] for _ in range(257)] == [*range(256), 0]
 
 
 @pytest.mark.parametrize("kind", [None, dialect.MAV_TYPE_GCS])
