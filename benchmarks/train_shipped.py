@@ -4,8 +4,8 @@ python -m benchmarks.train_shipped toge --out training
 
 Both start from the weights shipped before, taken from this repository's history. toge: in three
 rounds they fly, the expert corrects them, and they learn from that. toge-rates learns the end of a
-flight alone, in two rounds, and then other looks (teach_looks.py). What shipped was made a little
-differently (policy/weights/README.md), and neither recipe has been run as a whole.
+flight alone, in two rounds. Then both learn other looks (teach_looks.py). What shipped was made a
+little differently (policy/weights/README.md), and neither recipe has been run as a whole.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
 kept, and an unfinished training begins again. Seeds determine the flights. Training budgets are
@@ -32,7 +32,7 @@ NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, LOOPS, PX4 = "--action rates --courses race", "--courses loop", "--autopilot px4"
 STICKS, END = "--include-failed --ages 10:220", "--include-failed --ages 10:140 --only-end"
 
-LOOK_MINUTES = 250
+LOOK_MINUTES = {"toge": 68, "toge-rates": 250}
 BEFORE = "438fb84af6f14453cf773d90c24cdd1e15b7b50a"
 """Commit of 2026-11-27 with the weights to start from."""
 
@@ -75,9 +75,9 @@ STEPS: dict[str, tuple[Step, ...]] = {
         flights("loop3", f"--episodes 12 --seed 54 --speed 6.5 {LOOPS}", "second"),
         flights("px3", f"--episodes 16 --seed 53 --speed 6.5 {PX4}", "second"),
         training(
-            "toge",
+            "third",
             "easy1 loop1 px1 easy2 loop2 px2 easy3 loop3 px3",
-            f"--minutes 40 {STICKS} --pack",
+            f"--minutes 40 {STICKS}",
             start="second",
         ),
     ),
@@ -126,9 +126,9 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
         elif not (folder / step.makes).exists():
             run(folder, f"{step.command} --out partial.safetensors")
             (folder / "partial.safetensors").replace(folder / step.makes)
-    before, taught = folder / "stops.safetensors", folder / "toge-rates.safetensors"
-    if policy == "toge-rates" and not taught.exists():
-        teach_looks.main(before, out=taught, minutes=LOOK_MINUTES)
+    if not (taught := folder / f"{policy}.safetensors").exists():
+        before = folder / STEPS[policy][-1].makes
+        teach_looks.main(before, out=taught, minutes=LOOK_MINUTES[policy])
 
 
 def copy_weights_before(policy: str, path: Path) -> None:

@@ -46,7 +46,7 @@ def test_every_command_is_one_of_ours(
 
 def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_path: Path) -> None:
     (tmp_path / "toge").mkdir()
-    for weights in ("first", "second", "toge"):
+    for weights in ("first", "second", "third", "toge"):
         (tmp_path / "toge" / f"{weights}.safetensors").touch()
     train_shipped.main("toge", out=tmp_path)
     assert not [command for command in commands if command.startswith("train")]
