@@ -40,14 +40,14 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
 
     Raises:
         UserError: ``spec`` has no known form, names no file, needs a package that is missing,
-            or delivers images without a delay and ``latency_ms`` is not 0.
+            or stamps its frames itself and ``latency_ms`` is not 0.
     """
     kind, _, rest = spec.partition(":")
     is_file = stat.S_ISREG(mode := _file_mode(spec)) and not _is_stream(spec)
-    if latency_ms != 0.0 and (kind == "shm" or is_file or spec == NO_CAMERA):
+    if latency_ms != 0.0 and kind == "shm":
         raise UserError(
-            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its frames are stamped "
-            "with their exposure; mend a writer's stamps, or leave the flag out"
+            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps each "
+            "frame with its exposure; mend the stamps there, or leave the flag out"
         )
     if kind == "pipe":
         parse_pipe(rest)

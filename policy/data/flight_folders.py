@@ -153,12 +153,12 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     the same stick means something else. ``camera`` is one of several, by default the first.
     """
     name, meta = str(folder), _read_meta(folder)
+    damage: list[str] = []
+    ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     contract = _contract(name, meta)
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
-    damage: list[str] = []
     suffix = _camera_suffix(folder, contract.cameras, camera, damage)
-    ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
     video = folder / f"camera{suffix}.mp4"
     if not video.is_file():
@@ -324,7 +324,7 @@ def _read_table(
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     table, numbers = read_rows(folder / stem, damage, columns)
     if table.num_rows == 0:  # perhaps killed before its first rows
-        raise NothingToLearnError(f"{folder}: no {stem}: nothing was flown")
+        raise NothingToLearnError(f"{folder}: no {stem} were recorded")
     if missing := [name for name in columns if name not in table.column_names]:
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
     for column in filter(_TYPES.__contains__, columns):

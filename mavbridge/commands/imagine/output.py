@@ -27,6 +27,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray
+from mavbridge.core.stopping import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video_file import WRITE_ERRORS
@@ -70,6 +71,8 @@ def writing(path: Path) -> Iterator[None]:
 QUEUED_SEGMENTS = 2
 """Most segments that wait for the decoder; the loop then waits, too, so that the slowest part sets
 the pace."""
+STALL_S = 120.0
+"""Longest time without a finished frame."""
 END_S = 45.0
 """Longer than the timeout for a hung writer process."""
 _POLL_S = 0.1
@@ -126,12 +129,19 @@ class StreamedOutput:
         self._open.append(self._thread.submit(self._serve, segment, ready))
 
     def _wait(self, most: int, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Wait until at most ``most`` segments are open."""
+        """Wait until at most ``most`` segments are open, as long as frames are finished.
+
+        Waits are counted, not timed: a pause of the process (Ctrl-Z) is one of them.
+        """
+        seen, waits = self.frames, 0
         while len(self._open) > most:
             on_wait()
             if wait([self._open[0]], _POLL_S).done:
                 self._open[0].result()  # raises the thread's exception, also at the next call
                 self._open.popleft()
+            seen, waits = self.frames, waits + 1 if self.frames == seen else 0
+            if waits * _POLL_S > STALL_S:
+                raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Write all segments, close the files, and compare their lengths."""

@@ -156,7 +156,8 @@ class VehicleDiscovery:
             silent = f"system {self._target_system} is silent"
             return f"{silent}, but system {heard} was heard: correct link.target_system"
         if self._odd_ids:
-            found = " and ".join(f"{s.system}, component {s.component}" for s in self._odd_ids)
+            odd = sorted(self._odd_ids)
+            found = " and ".join(f"{each.system}, component {each.component}" for each in odd)
             return (
                 f"an autopilot was heard as system {found}, and component {AUTOPILOT_COMPONENT} of "
                 "another system than 0 is flown: set MAV_SYSID, SYSID_THISMAV or MAV_SYS_ID and "

@@ -59,7 +59,7 @@ class GuardStep:
     replayed: GuardTick | None
     """None: the replayed pass neither sent nor reported."""
     given: tuple[tuple[int, GuardInput], ...]
-    """Times and inputs of the guard's steps since the pass before; the last is that of this pass.
+    """Times and inputs of the guard's steps since the pass before, up to that of this pass, if any.
     On the way into a flight, and for an absence, a pass has no tick of its own."""
 
 
@@ -168,7 +168,7 @@ def replay_other(
         tick: GuardTick | None = None
         for at_ns, given in step.given:
             chunk = None if given.chunk is None else chunks.get(given.chunk.serial)
-            tick = guard.step(at_ns, replace(given, chunk=chunk)).tick
+            tick = guard.step(at_ns, replace(given, chunk=chunk, command_fault=None)).tick
         yield tick
 
 

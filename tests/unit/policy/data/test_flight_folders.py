@@ -263,7 +263,7 @@ def test_flights_with_nothing_to_learn_are_left_out(tmp_path: Path) -> None:
         f"{idle}: nobody to learn from: no expert, no sticks that a policy flew, and no sticks of "
         "a pilot while armed and in ALT_HOLD or ALTCTL",
         f"{copy}: a copy of {first}",
-        f"{bare}: no ticks: nothing was flown",
+        f"{bare}: no ticks were recorded",
     ]
     with pytest.raises(DatasetError, match="nobody to learn from"):
         read_flights([idle])
