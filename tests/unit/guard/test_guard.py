@@ -140,8 +140,8 @@ def test_while_nobody_asks_us_to_fly_slots_pass_and_nothing_is_sent() -> None:
 def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() -> None:
     guard = Stepped().engaged()
     early = guard.step(33, guard.chunk(33))
-    assert (early.decision, early.tick.is_slot) == (WANTED, False)
-    assert early.tick.missed_slots == 0
+    assert (early.decision, early.tick.is_slot, early.tick.index) == (WANTED, False, -1)
+    assert (early.tick.missed_slots, early.tick.decided_ns) == (0, START_NS + 33 * MS)
     served = guard.step(40)  # 7 ms later
     assert served.tick.index == 4
     assert served.decision == WANTED
