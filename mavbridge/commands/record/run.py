@@ -57,6 +57,8 @@ MAX_KEYS = 64
 """Capacity of the queue of keys for the next step; the oldest are dropped first."""
 JOIN_S = 2.0
 RERUN_CAPACITY = 1000
+DISK_NS = NS_PER_S
+"""Time between two checks of the disk."""
 GUARD_END_S = 5.0
 NOTHING = np.zeros((1, 1), np.float32)
 
@@ -114,7 +116,7 @@ class _Session:
         self._control = EpisodeControl(
             has_switch=config.episode_channel is not None, on_arm=config.on_arm
         )
-        self._disk_gb = 0.0
+        self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
         self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.visual_rate)
@@ -298,6 +300,10 @@ class _Session:
         return None
 
     def _look_at_disk(self) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns < self._disk_due_ns:
+            return
+        self._disk_due_ns = now_ns + DISK_NS
         self._disk_gb = disk_left_gb(self._config.out, self._config.disk_reserve)
         if self._disk_gb == 0.0:
             self._control.wanted = None
