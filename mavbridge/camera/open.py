@@ -43,21 +43,20 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
             or stamps its frames itself and ``latency_ms`` is not 0.
     """
     kind, _, rest = spec.partition(":")
-    is_file = stat.S_ISREG(mode := _file_mode(spec)) and not _is_stream(spec)
-    if latency_ms != 0.0 and kind == "shm":
-        raise UserError(
-            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps each "
-            "frame with its exposure; mend the stamps there, or leave the flag out"
-        )
-    if kind == "pipe":
+    mode = _file_mode(spec)
+    if kind == "shm":
+        if latency_ms != 0.0:
+            raise UserError(
+                f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps "
+                "each frame with its exposure; mend the stamps there, or leave the flag out"
+            )
+    elif kind == "pipe":
         parse_pipe(rest)
     elif kind == "jpeg-udp":
         parse_jpeg_udp(rest)
     elif kind == "screen":
         require_packages("--camera screen:", *SCREEN_PACKAGES)
-    elif not (
-        kind == "shm" or spec == NO_CAMERA or is_file or _is_stream(spec) or _is_device(spec)
-    ):
+    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or stat.S_ISREG(mode)):
         if stat.S_ISFIFO(mode):
             raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")

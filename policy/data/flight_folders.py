@@ -96,8 +96,10 @@ def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
     """Return the flights to learn from, and a line with the exclusions and their reasons."""
+    if include_failed:
+        return list(folders), None
     failures = {folder: failure_of(folder) for folder in folders}
-    counts = Counter(why for why in failures.values() if why and not include_failed)
+    counts = Counter(why for why in failures.values() if why)
     if not counts:
         return list(folders), None
     exemplary = [folder for folder in folders if failures[folder] is None]

@@ -31,7 +31,7 @@ def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
     contract = default_contract(image_size)
     if kind == "resnet-unet":
         return BuiltinConfig(kind="resnet-unet", size=size, backbone="resnet18", contract=contract)
-    return BuiltinConfig(size=size, backbone=backbone or "resnet8", contract=contract)
+    return BuiltinConfig(size=size, backbone=backbone or BuiltinConfig.backbone, contract=contract)
 
 
 def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:

@@ -17,11 +17,8 @@ def load_policy_of(
     plan: Plan, *, seed: int, num_diffusion_steps: int
 ) -> tuple[LeRobotPolicy, list[str]]:
     """Build a policy, load its weights, draw the initial noise; return notes for the user too."""
-    path, advice, config = (
-        plan.folder / WEIGHTS_FILE,
-        "Copy both files again, from one folder",
-        plan.config,
-    )
+    path, config = plan.folder / WEIGHTS_FILE, plan.config
+    advice = "Copy both files again, from one folder"
     policy: LeRobotPolicy
     notes = list(plan.notes)
     if isinstance(config, ActConfig):
