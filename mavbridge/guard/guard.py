@@ -93,6 +93,8 @@ class Guard:
         """Inputs of the last step."""
         self._last = self._neutral
         """Last action sent."""
+        self._before = self._smoother.state, self._last
+        """Both before the last decision."""
         self._messages: list[str] = []
 
     @property
@@ -121,7 +123,7 @@ class Guard:
         """Discard the last decision, which was not sent; continue from the one before. A read-only
         flight goes on as if it were sent."""
         if not self.engagement.settings.readonly:
-            self._smoother.undo()
+            self._smoother.state, self._last = self._before
             self._grid.unserve()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
@@ -149,6 +151,7 @@ class Guard:
         if slot is not None or is_urgent:
             self._grid.serve(now_ns)
             is_thrust = inputs.status.mode in given.link.modes.thrust
+            self._before = self._smoother.state, self._last
             decision, trace = self._decide(actions.control, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
         tick = GuardTick(

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.rotation import heading_rad, roll_pitch_rad
@@ -129,6 +129,15 @@ class Smoothing:
     """Longest integration step [s], longer than any period; prevents a jump after a stall."""
 
 
+class FilterState(NamedTuple):
+    """State of the filter after a step."""
+
+    stepped_ns: int | None
+    """Time of the step; None: none since the reset."""
+    slewed: Action
+    smoothed: Action
+
+
 class ActionSmoother:
     """Filter: clip, then rate limit, then low-pass, over the measured time between calls.
 
@@ -147,38 +156,30 @@ class ActionSmoother:
 
     def reset(self, start: Action) -> None:
         """Reset the filter to the vehicle's current command."""
-        self._last_ns: int | None = None
-        self._slewed = self._smoothed = self._before = start
-
-    def undo(self) -> None:
-        """Reset the filter to the output before the last step, which was not sent."""
-        self.reset(self._before)
+        self.state = FilterState(None, start, start)
 
     def step(self, raw: Action, now_ns: int) -> ActionTrace:
         """Filter one finite action; the first step after a reset has zero duration."""
-        dt_s = 0.0
-        if self._last_ns is not None:
-            dt_s = min(max(now_ns - self._last_ns, 0) / NS_PER_S, self._settings.max_dt_s)
-        self._last_ns = now_ns
+        dt_s, before = 0.0, self.state
+        if before.stepped_ns is not None:
+            dt_s = min(max(now_ns - before.stepped_ns, 0) / NS_PER_S, self._settings.max_dt_s)
         clipped = self.limits.clip(raw)
-        before = self._slewed
-        slewed = self.limits.approach(before, clipped, dt_s)
+        slewed = self.limits.approach(before.slewed, clipped, dt_s)
         smoothed = self._low_pass(before, slewed, dt_s)
-        self._before = self._smoothed
-        self._slewed, self._smoothed = slewed, smoothed
+        self.state = FilterState(now_ns, slewed, smoothed)
         return ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
 
-    def _low_pass(self, u0: Action, u1: Action, dt_s: float) -> Action:
+    def _low_pass(self, before: FilterState, u1: Action, dt_s: float) -> Action:
         tau_s = self._settings.tau_s
         if tau_s == 0:
             return u1
         if dt_s == 0:
-            return type(u1)(*self._smoothed)
+            return type(u1)(*before.smoothed)
         decay = math.exp(-dt_s / tau_s)
         lag = tau_s / dt_s
         filtered = (
             (a, b, y, b - (b - a) * lag + (y - a + (b - a) * lag) * decay)
-            for a, b, y in zip(u0, u1, self._smoothed, strict=True)
+            for a, b, y in zip(before.slewed, u1, before.smoothed, strict=True)
         )
         # An average of the three: rounding must not carry it beyond their bounds.
         return type(u1)(*[min(max(z, min(a, b, y)), max(a, b, y)) for a, b, y, z in filtered])

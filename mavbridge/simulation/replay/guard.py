@@ -169,6 +169,8 @@ def replay_other(
         for at_ns, given in step.given:
             chunk = None if given.chunk is None else chunks.get(given.chunk.serial)
             tick = guard.step(at_ns, replace(given, chunk=chunk, command_fault=None)).tick
+        if step.recorded.is_refused:
+            guard.unsent()
         yield tick
 
 

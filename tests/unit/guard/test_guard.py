@@ -23,6 +23,7 @@ from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
     Action,
+    ActionKind,
     ActionMeaning,
     AttitudeThrust,
     BodyRates,
@@ -335,8 +336,36 @@ def test_sticks_that_were_not_sent_are_not_gone_on_from_but_where_none_are_sent(
     guard.guard.unsent()
     decision = guard.step(70).decision
     assert isinstance(decision, Sticks)
-    assert decision.throttle == pytest.approx(0.05 if readonly else 0.02)
+    assert decision.throttle == pytest.approx(0.05 if readonly else 0.04)  # sent 20 ms before
     assert guard.step(200).tick.phase is (Phase.WAITING if readonly else Phase.LEAVING)
+
+
+@pytest.mark.parametrize("every", [2, 3])
+@pytest.mark.parametrize(
+    ("kind", "wanted", "at_rest"),
+    [
+        ("sticks", WANTED, NEUTRAL),
+        ("rates", BodyRates(0.5, 1.0, -0.5, 0.3), AttitudeThrust(0.4, 0.0, 0.0, 0.0)),
+        ("velocity", Velocity(3.0, -2.0, 1.0, 0.2), Velocity(0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_commands_reach_their_goal_though_the_link_refuses_every_second_or_third(
+    every: int, kind: ActionKind, wanted: Action, at_rest: Action
+) -> None:
+    smoothing = Smoothing(limits=limits_of(kind), tau_s=0.05)
+    guard = Stepped(meaning=ActionMeaning(kind=kind, hover_thrust=0.4), smoothing=smoothing)
+    guard.engaged(sticks=wanted)
+
+    flown: list[Decision | None] = []
+    for at_ms in range(40, 4040, 10):
+        chunk = guard.chunk(at_ms, wanted) if at_ms < 2040 else None
+        act: OperatorCommand | None = "release" if at_ms == 2040 else None
+        flown.append(guard.step(at_ms, chunk, act=act).decision)
+        if at_ms // 10 % every and not isinstance(flown[-1], Release | None):
+            guard.guard.unsent()
+    assert flown[199] == pytest.approx(wanted, abs=0.01)
+    braked = [each for each in flown if not isinstance(each, Release | None)][-1]
+    assert braked == pytest.approx(at_rest, abs=0.01)
 
 
 # --- what link and vehicle say
