@@ -255,8 +255,8 @@ class LinkSnapshot:
     status: VehicleStatus | None
     problem: Reason | None
     """Why actions must not be sent (no heartbeat, handshake, override switch, no echo), or None."""
-    is_overruled: bool = False
-    """The vehicle acts on other sticks than ours: another source has control."""
+    overruled: Reason | None = None
+    """How the vehicle shows that it acts on other sticks than ours, or None."""
     is_switched_off: bool = False
     """The pilot holds the switch that forbids overrides (RCn_OPTION 46) low."""
     echo_confirmed: bool = False

@@ -288,7 +288,7 @@ class DisengageSequence:
         """
         if self.mode is None or self.asked_ns is None or now.status.mode != now.link.modes.override:
             return False
-        if not now.link.echo_confirmed or now.link.is_overruled:
+        if not now.link.echo_confirmed or now.link.overruled is not None:
             return False
         undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
         is_undecided = now.now_ns - undone_ns <= WORD_NS
@@ -301,7 +301,7 @@ class DisengageSequence:
     def _watch_undoing(self, now: EngagementInputs) -> None:
         if self.mode is None or self.asked_ns is None:
             return
-        if not now.link.echo_confirmed or now.link.is_overruled:
+        if not now.link.echo_confirmed or now.link.overruled is not None:
             return
         if now.status.mode == now.link.modes.override:
             self.undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns

@@ -248,7 +248,7 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
         (m.settings.is_setpoint and now.status.armed and is_own)
-        and (not now.link.is_overruled and _failsafe(m, now, keeps_mode=False) is None)
+        and (now.link.overruled is None and _failsafe(m, now, keeps_mode=False) is None)
         and (now.status.mode == m.own_mode and now.status.mode in now.link.modes.setpoint)
     )
 
@@ -308,8 +308,8 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     is_preparing = m.phase is Phase.PREPARING
     if now.link.interruptions != m.seen_interruptions:
         return now.link.interruption
-    if now.link.is_overruled:
-        return now.link.problem
+    if now.link.overruled is not None:
+        return now.link.overruled
     if now.link.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
     is_held = m.phase in (LEAVING, HOLDING) and m.heeds_switch

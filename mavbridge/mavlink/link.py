@@ -133,7 +133,7 @@ class MavlinkLink:
         return snapshot(
             status=output.in_policy_terms(status, vehicle, now_ns),
             problem=problem or others or output.unheard(now_ns),
-            is_overruled=others is not None,
+            overruled=others,
             is_switched_off=output.is_sticks and vehicle.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),

@@ -247,7 +247,7 @@ class GuardWorld:
             telemetry=level_telemetry(now_ns),
             status=output.in_policy_terms(vehicle.status(now_ns), vehicle, now_ns),
             problem=self.link_problem or others or output.unheard(now_ns),
-            is_overruled=others is not None,
+            overruled=others,
             is_switched_off=output.is_sticks and self.is_switched_off,
             echo_confirmed=output.echo_confirmed,
             is_released=output.is_released(vehicle, now_ns),

@@ -146,7 +146,7 @@ def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again(seconds: fl
         (0, 0.01, {}, 11),
         (NS_PER_S, 1.01, {}, 0),
         (NS_PER_S, 0.01, {"echo_confirmed": False}, 0),
-        (NS_PER_S, 0.01, {"problem": OVERRULED, "is_overruled": True}, 0),
+        (NS_PER_S, 0.01, {"overruled": OVERRULED}, 0),
     ],
 )
 def test_another_stations_mode_and_a_hand_of_the_pilots_win(

@@ -30,6 +30,7 @@ WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
 NO_CHUNK, NO_IMAGE, LOST = because(Code.NO_CHUNK), because(Code.NO_IMAGE), Code.HEARTBEAT_LOST
 TILT = because(Code.BEYOND, quantity="tilt", value=70.0, limit=60.0, unit="deg")
 OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
+GONE = because(Code.CONNECTION_LOST)
 REBOOT = {"interruption": because(Code.REBOOTED)}
 RADIO_FAILSAFE = {"is_failsafe": True, "mode": "RTL"}
 KEPT = {"is_failsafe": True}
@@ -277,8 +278,8 @@ CASES = {
     **{
         f"takeover: {code.value}": Case(flying, changes, RELEASING, RELEASE, why=code)
         for code, changes in (
-            (Code.REBOOTED, {**REBOOT, "problem": OVERRULED, "is_overruled": True}),
-            (Code.OVERRULED, {"problem": OVERRULED, "is_overruled": True, "is_switched_off": True}),
+            (Code.REBOOTED, {**REBOOT, "overruled": OVERRULED}),
+            (Code.OVERRULED, {"overruled": OVERRULED, "problem": GONE, "is_switched_off": True}),
             (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True, "armed": False}),
             (Code.DISARMED, {"armed": False, "is_failsafe": True}),
             (Code.FAILSAFE, RADIO_FAILSAFE),
@@ -302,7 +303,7 @@ CASES = {
             (Code.MODE_CHANGED, {"mode": "AUTO.LOITER"}),
             (Code.DISARMED, {"armed": False}),
             (Code.FAILSAFE, {"is_failsafe": True}),
-            (Code.OVERRULED, {"problem": OVERRULED, "is_overruled": True}),
+            (Code.OVERRULED, {"overruled": OVERRULED}),
             (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True}),
         )
     },
@@ -313,9 +314,9 @@ CASES = {
     "setpoints, failsafe that changes it": Case(in_guided, RADIO_FAILSAFE, RELEASING, RELEASE,
         why=Code.FAILSAFE),
     "setpoints in a mode of sticks": Case(partial(flying, altered(OFFBOARD, mode="POSCTL"),
-        **{**SETPOINTS, "modes": ("POSCTL")}), REBOOT, RELEASING, RELEASE),
+        **{**SETPOINTS, "modes": ("POSCTL",)}), REBOOT, RELEASING, RELEASE),
     "sticks in a mode of setpoints": Case(partial(flying, altered(AIRBORNE, mode="GUIDED"),
-        modes=("GUIDED")), REBOOT, RELEASING, RELEASE),
+        modes=("GUIDED",)), REBOOT, RELEASING, RELEASE),
     "key": Case(partial(flying, **LANDS), KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
     "signal": Case(partial(flying, **LANDS), {"stop": SIGNAL, **KEY}, LEAVING, NEUTRAL,
         "LAND", Code.SIGNAL),
