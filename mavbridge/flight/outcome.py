@@ -38,6 +38,18 @@ _ENDS: dict[FlightEnd, str] = {
     "fault": "a fault",
 }
 _UNPLANNED = ("takeover", "disarmed", "fault")
+_END_BY_REASON: dict[Code, FlightEnd] = {
+    Code.COURSE_DONE: "course",
+    Code.POLICY_STOPPED: "stopped",
+    Code.DURATION: "duration",
+    Code.LANDED: "landed",
+    Code.OPERATOR: "operator",
+    Code.SIGNAL: "signal",
+    Code.DISARMED: "disarmed",
+    **dict.fromkeys((Code.FAILSAFE, Code.REBOOTED, Code.CLOCK_SET_BACK), "takeover"),
+    **dict.fromkeys((Code.MOVED, Code.REPLACED), "takeover"),
+}
+"""Ends by reason. Other reasons: a takeover if they are the pilot's, else a fault."""
 
 
 class Standstill:
@@ -108,8 +120,8 @@ class FlightReferee:
         """Kind of end of the policy's last flight, by its reason alone."""
         if self.reason is None:
             return "fault"
-        taken: FlightEnd = "takeover" if self.reason.kind is Kind.PILOT else "fault"
-        return next((end for end in _ENDS if end == self.reason.code), taken)
+        other: FlightEnd = "takeover" if self.reason.kind is Kind.PILOT else "fault"
+        return _END_BY_REASON.get(self.reason.code, other)
 
     @property
     def crash(self) -> str | None:

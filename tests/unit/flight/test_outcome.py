@@ -201,7 +201,9 @@ def test_a_second_flight_has_a_reason_of_its_own() -> None:
     ("code", "end"),
     [
         *((code, code.value) for code in (Code.OPERATOR, Code.DURATION, Code.LANDED, Code.SIGNAL)),
+        *((Code.COURSE_DONE, "course"), (Code.POLICY_STOPPED, "stopped")),
         *((Code.DISARMED, "disarmed"), (Code.OVERRIDE_SWITCH_OFF, "takeover")),
+        *((code, "takeover") for code in (Code.FAILSAFE, Code.REBOOTED, Code.REPLACED)),
         *((Code.POLICY_FAILED, "fault"), (Code.CONNECTION_LOST, "fault")),
     ],
 )
