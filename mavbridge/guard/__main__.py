@@ -72,11 +72,10 @@ def _run(
     received: list[bytes],
     stack: ExitStack,
 ) -> None:
-    clock, log, signing = MonotonicClock(), None, None
+    clock, log, signing, problem = MonotonicClock(), None, None, None
     if settings.link.signing is not None:
         signing = stack.enter_context(store := SigningStore(settings.link.signing, clock))
-        if store.problem is not None:
-            port.send(encode_from_guard(store.problem))
+        problem = store.problem
     if settings.tlog_fd is not None:
         log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
     transport = make_transport(settings.link.connect, clock)
@@ -91,9 +90,10 @@ def _run(
     loop = GuardLoop(clock, link, port, samples=samples, received=received, lead_ns=LEAD_NS)
     told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
-    refusal = settle_guard(realtime=settings.realtime)
-    if refusal is not None:
-        port.send(encode_from_guard(refusal))
+    # After the link is open: the first message tells the flight process so.
+    for text in (problem, settle_guard(realtime=settings.realtime)):
+        if text is not None:
+            port.send(encode_from_guard(text))
     try:
         loop.run(port)
     except BaseException:
