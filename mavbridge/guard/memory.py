@@ -124,7 +124,7 @@ class Memory:
         self.refusal, self.act = not_engaged(why), None
 
     def tell(self, _: EngagementInputs, why: Reason) -> None:
-        """said, for it may not follow the pilot's sticks"""
+        """warn: this mode may ignore the pilot's sticks"""
         self.refusal = why
 
     def call_off(self, now: EngagementInputs, _cause: bool) -> None:
@@ -207,7 +207,7 @@ class Memory:
         self._note_release(now)
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
-        """nothing"""
+        """an unseen release is reported"""
         self.disengage.mode = None  # every later mode change comes from someone else
         if not now.link.is_released:
             self.refusal = because(Code.RELEASE_NOT_SEEN)
