@@ -80,8 +80,8 @@ class Code(StrEnum):
         "the policy has not returned a usable chunk since its reset: {why}"
     )
     NOT_READY = _vehicle(
-        "the vehicle is not ready after {after_s:.0f} s (mode {mode}, armed {is_armed}, overrides "
-        "seen {is_echoed}, inputs {inputs}): see its messages above"
+        "the vehicle is not ready after {after_s:.0f} s (mode: {mode}; armed: {is_armed}; shows "
+        "our sticks: {is_echoed}; inputs: {inputs}): see its messages above"
     )
     # Takeovers
     OPERATOR = _pilot("released by the operator")
@@ -339,7 +339,10 @@ class Reason:
 
     def __str__(self) -> str:
         """Return the sentence for the user."""
-        words = dict(self.data)
+        words = {
+            name: ("no", "yes")[value] if isinstance(value, bool) else value
+            for name, value in self.data
+        }
         text = self.code.sentence.format(**words)
         if self.code in (Code.OVERRULED, Code.UNHEARD):
             keys = ((str(words.get(name)), str(words.get("fault"))) for name in _CAUSE_OF)
