@@ -162,22 +162,28 @@ class PictureCutter(FrameCutter):
         super().__init__()
         self._at = 0
         """Position at which the search continues; 0 until a picture's start is found."""
-        self._in_scan = self._is_png = False
+        self._in_scan = self._is_png = self._has_found = False
+        self._damaged = 0
+        """Consecutive pictures that were dropped because they were damaged."""
 
     def _find_end(self, arrived_ns: int) -> int | None:
-        if self._at == 0 and not self._find_start(arrived_ns):
-            return None
-        if not (self._find_png_end() if self._is_png else self._find_jpeg_end(arrived_ns)):
-            if len(self._buffer) > MAX_JPEG_BYTES:
-                raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
-            return None
-        end, self._at, self._in_scan = self._at, 0, False
-        return end
+        while self._at or self._find_start(arrived_ns):
+            if self._find_png_end() if self._is_png else self._find_jpeg_end(arrived_ns):
+                end, self._at, self._in_scan = self._at, 0, False
+                self._has_found, self._damaged = True, 0
+                return end
+            if self._at:
+                if len(self._buffer) > MAX_JPEG_BYTES:
+                    raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
+                return None
+        return None
 
     def _find_start(self, arrived_ns: int) -> bool:
         start = _START.search(self._buffer)
         if start is None:
-            if len(self._buffer) > MAX_BETWEEN_BYTES:
+            if self._has_found:  # the rest of a damaged picture, or padding
+                del self._buffer[: -len(_PNG)]
+            elif len(self._buffer) > MAX_BETWEEN_BYTES:
                 begin = bytes(self._buffer[:8]).hex(" ")
                 raise CameraError(
                     f"its output is no MJPEG and no PNG: it begins with {begin}; for raw pictures "
@@ -192,7 +198,8 @@ class PictureCutter(FrameCutter):
     def _find_jpeg_end(self, arrived_ns: int) -> bool:
         """Walk over the segments of the picture. Return True if it ends at ``_at``.
 
-        If another picture starts before, the first was cut off, and is dropped.
+        If another picture starts before, the first was cut off, and is dropped. If it is damaged,
+        its start is dropped, and ``_at`` becomes 0.
         """
         buffer = self._buffer
         while True:
@@ -206,7 +213,7 @@ class PictureCutter(FrameCutter):
                 return False
             marker = buffer[self._at + 1]
             if buffer[self._at] != 0xFF:
-                raise CameraError("its output is no MJPEG, or a damaged one")
+                return self._drop_damaged()
             if marker == _EOI:
                 self._at += 2
                 return True
@@ -222,6 +229,15 @@ class PictureCutter(FrameCutter):
                 return False
             self._at += 2 + length
             self._in_scan = marker == _SOS
+
+    def _drop_damaged(self) -> bool:
+        """Drop the start of a damaged picture, so that the next one is searched for."""
+        self._damaged += 1
+        if self._damaged > MAX_BAD_FRAMES:
+            raise CameraError("its output is no MJPEG, or a damaged one")
+        del self._buffer[: len(_SOI)]
+        self._at = 0
+        return False
 
     def _find_png_end(self) -> bool:
         """Walk over the chunks of the picture. Return True if it ends at ``_at``."""
