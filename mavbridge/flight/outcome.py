@@ -53,7 +53,7 @@ _END_BY_REASON: dict[Code, FlightEnd] = {
 
 
 class Standstill:
-    """Tells by the ticks of a policy when it has stopped a vehicle that it had flown."""
+    """Tells by the ticks of a policy when it has stopped a vehicle that it had moved."""
 
     def __init__(self) -> None:
         self._has_moved = False
@@ -62,9 +62,10 @@ class Standstill:
     def see(self, tick: Tick) -> None:
         """Follow a tick; those without the policy in control interrupt a standstill."""
         speed_mps = math.nan if tick.state is None else tick.state.speed_mps
-        self._has_moved = self._has_moved or speed_mps > MOVED_MPS
+        is_flying = tick.phase == Phase.FLYING
+        self._has_moved = is_flying and (self._has_moved or speed_mps > MOVED_MPS)
         is_still = self._has_moved and speed_mps < STILL_MPS
-        if tick.phase != Phase.FLYING or not is_still:
+        if not is_still:
             self._since_ns = None
         elif self._since_ns is None:
             self._since_ns = tick.sent_ns

@@ -172,6 +172,17 @@ def test_a_policy_that_stops_ends_its_flight_by_that() -> None:
     assert stopping(3.0, gates=GATES) == (late, "course"), "at last"
 
 
+@pytest.mark.parametrize("before", ["preparing", "waiting", "flying", "released"])
+def test_what_moved_the_vehicle_before_the_flight_does_not_end_it(before: str) -> None:
+    referee = FlightReferee(None, stops=True)
+    phases = [before] * 50 + ["released"] * (before == "flying") + ["flying"] * 300
+    for tick, phase in zip(course_ticks(len(phases)), phases, strict=True):
+        moving = np.zeros(13, np.float32)
+        moving[0] = 2.5 if phase == before and tick.index < 50 else 0.1
+        referee.emit(replace(tick, phase=phase, state=make_state(values=moving)))
+        assert referee.ending(tick.sent_ns) is None
+
+
 def test_without_guards_a_flight_is_told_by_its_end() -> None:
     outcome = judged(course_ticks(201), "duration", gates=None)
     assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (None, None, None)
