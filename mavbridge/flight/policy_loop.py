@@ -252,8 +252,10 @@ class PolicyLoop:
             actions=_kept(array),
         )
         self._view.remember(solve, observation.captured_ns)
-        self._chunk = chunk_of(solve, self._action_frame)
-        self._send(self._chunk)
+        chunk = chunk_of(solve, self._action_frame)
+        if np.isfinite(array).all():  # else the guard flies on by the one before
+            self._chunk = chunk
+        self._send(chunk)
         for watch in self._watches:
             watch(solve)
 

@@ -13,7 +13,7 @@ from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import Reading, Sample, Sticks, Telemetry
+from mavbridge.core.vehicle import ACTION_CLASSES, Reading, Sample, Sticks, Telemetry
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
@@ -178,6 +178,27 @@ def test_the_prefix_holds_what_flies_until_the_chunk_takes_over() -> None:
     assert not np.isnan(history[0, :2]).any()
     assert history[0, 2:6, 0] == pytest.approx((207 + 50 * np.arange(4)) / 50 / 100)
     assert np.isnan(history[0, 6:]).all()  # 200 ms later the next chunk flies
+
+
+@pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_chunk_that_the_guard_must_refuse_is_not_what_is_foreseen(kind: str, bad: float) -> None:
+    def chunk() -> FloatArray:
+        actions = np.full((1, 3, 4), 0.1, np.float32)
+        actions[0, 1, 0] = bad if rig.solves == 3 else 0.1
+        return actions
+
+    contract = {"action": kind, "state_time": "execution", "horizon": 3, "chunk_dt_s": 0.1}
+    rig = Rig(chunk, period_ms=100, **contract)
+    rig.solve_ns, rig.north_mps = 60 * MS, 3.0
+    rig.begin_flight()
+    for _ in range(6):
+        rig.see(age_ns=5 * MS).measure()
+        rig.loop.step()
+        assert all(np.isfinite(each).all() for each in rig.given)
+        sent = ACTION_CLASSES[contract["action"]](0.1, 0.0, 0.0, 0.0)
+        rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING, sent=sent))
+        rig.clock.advance_ns(40 * MS)
 
 
 def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:
