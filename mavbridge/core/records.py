@@ -86,8 +86,6 @@ class Tick(GuardTick):
     Missed slots count if the policy had control at this tick and at the last one.
     """
 
-    serial: int
-    """Number among all ticks of the flight. A gap is a tick that the observer dropped."""
     predict_ns: int | None
     """Duration of the policy's solve; None if no chunk was flown."""
     feature_frame_id: int | None

@@ -10,6 +10,8 @@ from mavbridge.core.vehicle import Action, ActionTrace
 class GuardTick:
     """One send of the guard, or one slot without anything to send."""
 
+    serial: int = 0
+    """Number among all ticks of the flight. A gap is a tick that a reader could not take."""
     index: int
     """Number of the slot on the stick grid; -1 between slots."""
     is_slot: bool = True

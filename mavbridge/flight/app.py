@@ -388,7 +388,5 @@ class _Flight:
                 f"{summary.dropped_messages} messages of the guard were dropped: this process was "
                 "too busy to read them"
             )
-        # After a reboot in flight the mode is unknown until the next heartbeat.
-        is_found = view.status.mode is not None or view.flights > 0
-        autopilot = view.status.autopilot if is_found else None
+        autopilot = view.status.autopilot if view.is_found else None
         self._observers.finish(self._guard.summary, autopilot, self._outcome)

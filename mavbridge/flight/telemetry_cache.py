@@ -79,9 +79,10 @@ class TelemetryCache:
         """Held while samples are read."""
         self._is_awaited = False
         """True while the policy's thread waits and reads the samples itself."""
-        self._serial = 0
         self._texts: list[str] = []
         self.status = GuardStatus("none", None, False, None, (), None)
+        self.is_found = False
+        """True once the vehicle has told its mode, also if a reboot has made it unknown again."""
         self._was_flown = False
         """True if the policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
@@ -153,6 +154,7 @@ class TelemetryCache:
                 if message[:4] != self.status[:4]:
                     _log.debug("vehicle: %s, %s, armed %s, landed %s", *message[:4])
                 self.status = message
+                self.is_found = self.is_found or message.mode is not None
             case str() as text:
                 self._texts.append(text)
             case Packets(packets):
@@ -184,7 +186,6 @@ class TelemetryCache:
             self.history.append(tick.sent, tick.sent_ns)
         self._sink.emit(joined)
         self._was_flown = tick.trace is not None
-        self._serial += 1
 
     def _join(self, sent: GuardTick) -> Tick:
         """Join the guard's report with the inputs of the chunk that was flown."""
@@ -198,7 +199,6 @@ class TelemetryCache:
             reported["missed_slots"] = 0
         return Tick(
             **reported,
-            serial=self._serial,
             predict_ns=solve.computed_ns - solve.started_ns if solve else None,
             feature_frame_id=solve.frame_ids[-1][0] if solve else None,
             feature_captured_ns=captured_ns,

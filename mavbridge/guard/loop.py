@@ -108,6 +108,8 @@ class GuardLoop:
         self._known: object = None
         """State of the link and the vehicle at the last pass, motion excluded."""
         self._stepped_ns = 0
+        self._reports = 0
+        """Number of ticks sent to the flight process, with those that it did not take."""
         self.is_done = False
         """True once control has been given back and no further flight will follow."""
 
@@ -208,7 +210,15 @@ class GuardLoop:
         phase = self.guard.engagement.phase
         if tick.is_slot or wanted is not None or phase is not self._phase:
             due_ns, sent_ns = tick.due_ns if tick.is_slot else woke_ns, self._clock.now_ns()
-            tick = replace(tick, due_ns=due_ns, woke_ns=woke_ns, sent_ns=sent_ns, sent=sent)
+            tick = replace(
+                tick,
+                serial=self._reports,
+                due_ns=due_ns,
+                woke_ns=woke_ns,
+                sent_ns=sent_ns,
+                sent=sent,
+            )
+            self._reports += 1
             self._flight.send(encode_from_guard(tick))
         self._follow(output)
         if phase is not self._phase:
@@ -297,18 +307,19 @@ class GuardLoop:
             self._flight.send(encode_from_guard(text))
 
     def _report_status(self, vehicle: VehicleStatus | None) -> None:
+        is_read = self.guard is not None
         status = GuardStatus(
             autopilot=self._link.autopilot,
             mode=vehicle.mode if vehicle else None,
             armed=vehicle is not None and vehicle.armed,
             is_landed=vehicle.is_landed if vehicle else None,
-            rc_channels_us=vehicle.rc_channels_us if vehicle else (),
-            rc_sticks=vehicle.rc_sticks if vehicle else None,
+            # They change with each message, and nobody reads before a policy is loaded.
+            rc_channels_us=vehicle.rc_channels_us if vehicle and is_read else (),
+            rc_sticks=vehicle.rc_sticks if vehicle and is_read else None,
             has_position=self._watches_position and bool(vehicle and vehicle.position_ned_m),
         )
-        if status != self._status:
-            self._status = status
-            self._flight.send(encode_from_guard(status))
+        if status != self._status:  # one that the channel did not take is sent again
+            self._status = status if self._flight.send(encode_from_guard(status)) else None
 
     def _receive(self, snapshot: LinkSnapshot) -> GuardInput:
         """Read the messages of the flight process; keep the newest of each kind."""

@@ -122,9 +122,10 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     assert tick.release_reason == WAIT
 
 
-def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
-    viewed = Viewed().receive(NOBODY, "one", "two", NOBODY, NOBODY, GuardDiedError("three"))
-    assert [tick.serial for tick in viewed.sink.ticks] == [0, 1, 2]
+def test_ticks_keep_the_guards_numbers_and_take_the_words_along() -> None:
+    ticks = [replace(NOBODY, serial=serial) for serial in (0, 1, 4)]
+    viewed = Viewed().receive(ticks[0], "one", "two", *ticks[1:], GuardDiedError("three"))
+    assert [tick.serial for tick in viewed.sink.ticks] == [0, 1, 4]
     assert [tick.texts for tick in viewed.sink.ticks] == [(), ("one", "two"), ()]
 
 
@@ -143,6 +144,12 @@ def test_flights_are_counted_and_the_phase_is_that_of_the_guard() -> None:
     assert viewed.view.phase is Phase.FLYING
     viewed.receive(replace(NOBODY, phase=Phase.RELEASING, release_reason=OFF))
     assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, OFF)
+
+
+def test_a_vehicle_stays_found_while_a_reboot_hides_its_mode() -> None:
+    unknown = GuardStatus("ArduPilot", None, False, None, (), None)
+    assert not Viewed().receive(unknown).view.is_found
+    assert Viewed().receive(unknown._replace(mode="LOITER"), unknown).view.is_found
 
 
 def test_it_is_airborne_while_the_policy_flies_and_the_vehicle_says_so() -> None:

@@ -144,6 +144,31 @@ def test_the_vehicles_status_is_told_when_it_changes() -> None:
     ]
 
 
+def test_a_status_that_was_not_taken_is_told_again_and_lost_ticks_leave_a_gap() -> None:
+    rig = Rig().flying()
+    rig.port.takes = False
+    rig.link.change(mode="LOITER", armed=False)
+    rig.run(0.1)
+    rig.port.takes = True
+    last = rig.ticks[-1].serial
+    rig.run(0.05)
+    assert [(s.mode, s.armed) for s in rig.got(GuardStatus)[-1:]] == [("LOITER", False)]
+    later = [tick.serial for tick in rig.ticks if tick.serial > last]
+    assert later == list(range(later[0], later[0] + len(later)))
+    assert later[0] > last + 5
+
+
+def test_the_receivers_channels_are_not_told_before_somebody_reads() -> None:
+    rig = Rig(rc_sticks=NEUTRAL).run(0.1)
+    for us in range(1000, 1100):
+        rig.link.change(rc_channels_us=(us,) * 8)
+        rig.run(0.01)
+    assert [(s.rc_channels_us, s.rc_sticks) for s in rig.got(GuardStatus)] == [((), None)]
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    assert rig.got(GuardStatus)[-1].rc_channels_us == (1099,) * 8
+
+
 def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
     rig = Rig().flying()
     sent = [tick for tick in rig.ticks if tick.sent is not None]
