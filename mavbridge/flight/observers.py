@@ -158,14 +158,15 @@ class FlightObservers:
         self._recorder = recorder
 
     def close_recorder(self, outcome: FlightOutcome | None) -> None:
-        """Finish the recording. Call after the guard has ended, so that it holds the release."""
+        """Finish the recording. Call after the guard has ended, so that it has the release."""
         recorder, summary = self._recorder, self._guard.summary if self._guard else None
         if recorder is None or self._config.record is None:
             return
-        if recorder.close(RECORDER_JOIN_S):
-            meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
-            params = {} if summary is None else summary.params
-            self._write_end(replace(meta, parameters=params), self._config.record)
+        meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
+        params = {} if summary is None else summary.params
+        recorder.meta = replace(meta, parameters=params)
+        self._write_end(recorder.meta, self._config.record)  # in case that it takes too long
+        recorder.close(RECORDER_JOIN_S)
 
     def _write_end(self, meta: FlightMeta, folder: Path) -> None:
         """Add the outcome and the vehicle's parameters to ``meta.json``."""

@@ -149,7 +149,7 @@ class FlightMeta:
             return None
         if self.ticks is None:
             return "cut off: shown up to its last whole batch of rows"
-        return "images lost: the process that writes the video died; all else is whole"
+        return "images and packets lost: the process that writes them died; the tables are whole"
 
     @property
     def keeps_neutral(self) -> bool:

@@ -93,8 +93,12 @@ class Recorder(ObserverThread):
 
     @property
     def meta(self) -> FlightMeta:
-        """Contents of ``meta.json``; complete after ``close``."""
+        """Contents of ``meta.json``; complete after ``close``. Set before it, they are added to."""
         return self._flight.writer.meta
+
+    @meta.setter
+    def meta(self, meta: FlightMeta) -> None:
+        self._flight.writer.meta = meta
 
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
@@ -150,20 +154,20 @@ class _FlightConsumer:
         if misfit not in (None, told[1]):
             self.report(f"images are missing from the recording: {misfit}")
         if failure not in (None, told[0]):
-            self.report(f"recording no more images: {failure}; the rest is still recorded")
+            self.report(f"recording no more images: {failure}; ticks are still recorded")
 
     def close(self) -> None:
         """Finish in order; after an error, leave the files as they are."""
         if self._has_failed:
             self.writer.close()
             return
-        crash = self.crash_watch.reason
+        meta, crash = self.writer.meta, self.crash_watch.reason
         self.writer.finish(
             replace(
-                self.writer.meta,
+                meta,
                 autopilot=self.autopilot(),
                 packets_dropped=self.packets_dropped(),
-                success=None if crash is None else False,
+                success=meta.success if crash is None else False,
                 crash=crash,
             )
         )

@@ -59,11 +59,12 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
                 stood.recorder._closing.wait(0.01)
         send_signal(stood.pid, signal.SIGKILL)
         stood.emit(range(10, 40), range(10, 20))
+        stood.recorder.meta = replace(stood.recorder.meta, parameters={"RC_SPEED": 490.0})
     assert len(stood.told) == 1
     assert "recording no more images: the writer process has died" in stood.told[0]
     back = open_flight(tmp_path)
     assert back.ticks.num_rows == 40
-    assert not back.meta.finished
+    assert (back.meta.finished, back.meta.parameters) == (False, {"RC_SPEED": 490.0})
     assert 0 <= back.frames.num_rows <= 10
     assert len(list(back.images())) == back.frames.num_rows
     assert 10 <= stood.recorder.dropped <= 20
