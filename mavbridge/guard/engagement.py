@@ -58,8 +58,9 @@ class Engagement(Memory):
         )
 
     def stop(self, request: EndRequest) -> None:
-        """Give the sticks back as the request demands, then enter ``ENDED``."""
-        if self.end_request is None:
+        """Give the sticks back as the request demands, then enter ``ENDED``; the first counts."""
+        is_own = self.end_request is not None and self.end_request.reason is self.failure
+        if self.end_request is None or is_own:  # our own: a start that failed ends the guard
             self.end_request, self.must_stop = request, True
 
     def step(self, now: EngagementInputs, act: OperatorCommand | None) -> Actions:

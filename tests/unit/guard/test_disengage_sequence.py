@@ -255,6 +255,19 @@ def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral_and_no_hand_h
     assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
 
 
+@pytest.mark.parametrize("act", ["release", None])
+def test_a_start_that_failed_in_the_air_can_be_stopped_like_a_flight(act: Any) -> None:
+    facts = altered(NO_RECEIVER, armed=False, is_landed=True, height_m=0.0)
+    stepped = Stepped(facts, arm=True, takeoff_m=3.0)
+    stepped.run(0.1, mode="GUIDED")
+    stepped.run(1.0, armed=True, is_landed=False, height_m=3.0)
+    stepped.run(95, mode="ALT_HOLD", chunk_problem=because(Code.NO_IMAGE))
+    stepped.run(5, mode="BRAKE")
+    assert stepped.phase is Phase.HOLDING
+    stepped.step(act, stop=None if act else EndRequest(because(Code.SIGNAL)))
+    assert "LAND" in [move.mode for move in stepped.run(1)]
+
+
 def test_where_px4_may_take_a_jump_to_neutral_for_a_hand_the_throttle_stays() -> None:
     stepped = at_fault(altered(PX4, mode="STABILIZED"), modes=("STABILIZED",))
     assert {move.control for move in stepped.run(1.0, mode="AUTO.LOITER")} == {LEVEL}
