@@ -179,7 +179,7 @@ class EngageSequence:
         is_climbing = self.arms and now.status.armed and self.settings.takeoff_m is not None
         if now.link.problem is not None:
             # Without a receiver the end of sticks is a failsafe, even if we hear nothing.
-            is_held = is_climbing and not self.settings.is_setpoint
+            is_held = (is_climbing or self.lends_sticks) and not self.settings.is_setpoint
             return ControlSource.NEUTRAL if is_held else None
         if self.settings.is_setpoint:
             if not self.is_up:

@@ -228,7 +228,10 @@ def test_a_vehicle_without_sticks_that_refuses_the_mode_is_lent_ours_for_this_wa
     assert sequence.has_sticks
     flowed = altered(refused, now_ns=1 + FLOW_NS)
     assert sequence.step(flowed, None) == Actions(control=NEUTRAL, mode="ALTCTL")
-    assert sequence.step(altered(flowed, now_ns=2 + FLOW_NS), None) == Actions(control=NEUTRAL)
+    unheard = because(Code.HEARTBEAT_LOST)
+    for problem in (None, unheard):  # the end of sticks would be a failsafe
+        later = altered(flowed, now_ns=2 + FLOW_NS, problem=problem)
+        assert sequence.step(later, None) == Actions(control=NEUTRAL)
     sequence.begin(facts)
     assert not sequence.has_sticks
 
