@@ -80,8 +80,9 @@ class ActionSender:
 
     def equip(self, vehicle: VehicleSession) -> None:
         """Fly this session of the vehicle from now on; raises as ``begin_flight`` does."""
-        self._vehicle = vehicle
-        if self.output is not None:
+        before, self._vehicle = self._vehicle, vehicle
+        is_same_firmware = before is not None and before.profile is vehicle.profile
+        if self.output is not None and is_same_firmware:
             self.output.restart()
         elif self._flight is not None:
             meaning, wanted = self._flight

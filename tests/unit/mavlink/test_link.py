@@ -23,6 +23,7 @@ from mavbridge.core.vehicle import (
     Percentiles,
     Release,
     Sample,
+    Sticks,
 )
 from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.link import MavlinkLink
@@ -187,6 +188,19 @@ class Rig:
     def commands(self, number: int) -> list[tuple[float, float]]:
         messages = self.received("COMMAND_LONG")
         return [(m.param1, m.param2) for m in messages if m.command == number]
+
+
+def test_another_firmware_at_the_address_gets_sticks_of_its_own_kind() -> None:
+    rig = Rig().ready()
+    rig.vehicle.is_alive = False
+    rig.run(4.0)
+    rig.vehicle.is_alive = True
+    become_px4(rig)
+    rig.run(9.0)
+    rig.run(0.1, Sticks(0.1, 0.0, 0.2, 0.0))
+    assert rig.link.autopilot.startswith("px4")
+    assert rig.received("MANUAL_CONTROL")
+    assert not rig.received("RC_CHANNELS_OVERRIDE")
 
 
 PILOTS = Release()
@@ -358,13 +372,16 @@ def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() ->
     assert "vehicle: Arm: Throttle too high" in rig.texts
 
 
-def px4_rig(**config: Any) -> Rig:
-    rig = Rig(**config)
+def become_px4(rig: Rig) -> Rig:
     beat = rig.vehicle.end.heartbeat
     rig.vehicle.end.heartbeat = (  # type: ignore[method-assign]
         lambda **options: beat(**(options | {"autopilot": 12, "mode": 2 << 16}))
     )
     return rig
+
+
+def px4_rig(**config: Any) -> Rig:
+    return become_px4(Rig(**config))
 
 
 def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
