@@ -157,7 +157,10 @@ class EchoCheck:
         if shown_us < newest_us:  # do not compare old stamps with new ones
             self._forget_shown()
         if self.is_unshown(now_ns) and self._arrived_ns is not None:
-            self._restart(now_ns)
+            # Slow echoes must not put off the end of the wait for the first one of ours.
+            is_waiting = self.is_sending and not self.confirmed
+            if not is_waiting or now_ns - self._arrived_ns > CONFIRM_NS:
+                self._restart(now_ns)
         self._arrived_ns = now_ns
         if self._since_ns is None:
             self._baseline = values

@@ -267,7 +267,9 @@ class AttitudeOutput(SetpointOutput):
         is_boosted = isinstance(action, BodyRates) and vehicle.params.traits.boosts_thrust
         boost = self._cos_tilt if is_boosted else 1.0
         shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)
-        is_checked = shown[0] > 0 and not self._shows_rates  # leave idle motors idle
+        status = vehicle.status(now_ns)
+        is_idle = shown[0] == 0 and (status is None or status.is_landed is not False)
+        is_checked = not is_idle and not self._shows_rates  # leave idle motors idle
         if is_checked:
             shown = self.echo.with_dither(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS

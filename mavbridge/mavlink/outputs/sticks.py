@@ -258,11 +258,13 @@ class ManualControlOutput(StickOutput):
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Encode one level packet in modes flown by sticks, with the last throttle in thrust modes.
 
-        Without it the vehicle would fly on with the policy's last sticks for COM_RC_LOSS_T. After a
-        session restart the last known status counts: a reboot may be only a wrong timestamp.
+        Without it the vehicle would fly on with the policy's last sticks for COM_RC_LOSS_T; later
+        it holds none, and none must reach a pilot. After a session restart the last known status
+        counts: a reboot may be only a wrong timestamp.
         """
         status = vehicle.status(now_ns) or self._status
-        if status is None or status.mode not in _MODES:
+        is_over = now_ns - self._sent_ns > _HELD_NS
+        if status is None or status.mode not in _MODES or is_over:
             return None
         z = self._last[2] if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
         level = ManualControl(0, 0, z, 0)

@@ -168,7 +168,7 @@ def test_a_new_mode_that_is_not_told_yet_is_no_other_station(profile: Profile) -
 def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
     flight = attitude_flight(PX4)
     flight.vehicle.armed = state != "disarmed"
-    flight.vehicle.is_landed = state == "landed"
+    flight.vehicle.is_landed = {"landed": True, "idle": None}.get(state, False)
     if state == "another mode":
         flight.vehicle.mode = "ALTCTL"
     action = LEVEL._replace(thrust=0.0) if state == "idle" else LEVEL
@@ -179,6 +179,24 @@ def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
         assert flight.output.echo_confirmed
     if state == "idle":
         assert message.thrust == 0.0  # not dithered: the motors stay idle
+
+
+@pytest.mark.parametrize("is_rates", [False, True])
+@pytest.mark.parametrize("every", [10, 40, 90])
+def test_a_dive_without_thrust_does_not_hide_that_nothing_is_heard(
+    is_rates: bool, every: int
+) -> None:
+    flight = attitude_flight(ARDUPILOT, is_rates=is_rates)
+    level = BodyRates(0.45, 0.3, -0.2, 0.1) if is_rates else LEVEL
+    heard = 0.0
+    for k in range(700):
+        message: Any = flight.message(
+            flight.send(level._replace(thrust=0.0 if k % every == 0 else 0.45))
+        )
+        heard = message.thrust if k < 500 else heard
+        flight.receive(target(heard))
+        assert k > 500 or flight.problem is None
+    assert flight.problem.code is Code.UNHEARD
 
 
 # --- velocity

@@ -178,6 +178,28 @@ def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:
     assert flight.status.pilot_sticks == pilot
 
 
+@pytest.mark.parametrize("gap_ms", [50, 440, 500, 700, 950])
+def test_other_sticks_are_told_in_time_however_seldom_they_are_shown(gap_ms: int) -> None:
+    flight = px4_flight()
+    flight.receive(ManualControl(300, -200, 600, 0))
+    begun_ns = shown_ns = flight.now_ns
+    while flight.problem is None:
+        flight.send(Sticks(0.2, 0.1, -0.2, 0.3))
+        if flight.now_ns - shown_ns >= gap_ms * MS:
+            shown_ns = flight.now_ns
+            flight.receive(ManualControl(300, -200, 600, 0))
+        assert flight.now_ns - begun_ns < 1_100 * MS
+    assert flight.problem.code is Code.OVERRULED
+
+
+def test_a_release_that_comes_late_does_not_reach_who_flies_by_then() -> None:
+    flight = px4_flight()
+    flight.send(Sticks(0.2, 0.1, -0.2, 0.3))
+    for later_ms, is_sent in ((0, True), (700, True), (701, False), (60_000, False)):
+        packet = flight.output.release_packet(flight.session, flight.now_ns + later_ms * MS)
+        assert (packet is not None) is is_sent
+
+
 def test_sticks_are_released_once_others_are_shown_or_none() -> None:
     for shown in (ManualControl(200, 0, 400, 0), None):
         flight = px4_flight()
