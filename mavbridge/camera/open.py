@@ -1,11 +1,14 @@
 """Opening of the camera named by ``--camera``."""
 
+import logging
 import stat
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from mavbridge.camera.capture import open_device, open_stream, present_devices
@@ -14,12 +17,15 @@ from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.pipe import PipeSource, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import Camera, CameraImage, Frame
+from policy.contract import Contract
 from policy.errors import require_packages
 
+_log = logging.getLogger(__name__)
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = ("mss", "Xlib")
 """Modules of the extra "screen"."""
@@ -97,6 +103,34 @@ def _is_stream(spec: str) -> bool:
     )
 
 
+def open_cameras(
+    config: CameraConfig,
+    contract: Contract,
+    *,
+    image_size: tuple[int, int],
+    clock: Clock,
+    report: Callable[[str], None],
+    stack: ExitStack,
+) -> list[Camera]:
+    """Open the cameras of a flight, in the contract's order; see ``open_camera``. ``stack`` closes
+    them."""
+    cameras: list[Camera] = []
+    for source in config.sources_of(contract.cameras):
+        camera = open_camera(
+            source,
+            image_size=image_size,
+            clock=clock,
+            timeout_s=config.camera_timeout,
+            latency_ms=config.camera_latency,
+            report=report,
+            is_depth=contract.is_depth,
+        )
+        stack.callback(camera.close)
+        _log.debug("camera %s is open", without_secrets(source))
+        cameras.append(camera)
+    return cameras
+
+
 def open_camera(
     spec: str,
     *,
@@ -127,6 +161,8 @@ def open_camera(
         CameraError: no frame came in time, or the source cannot be used.
     """
     check_camera(spec, latency_ms=latency_ms)
+    # OpenCV would print its own complaint about a camera before, and instead of, ours.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     latency_ns = round(latency_ms * NS_PER_MS)
     camera = _open(spec, image_size, clock=clock, latency_ns=latency_ns, is_depth=is_depth)
     first: CameraImage | None = None

@@ -11,17 +11,16 @@ import cv2
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.open import open_camera
+from mavbridge.camera.open import open_cameras
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
 from mavbridge.core.observers import FanOut
-from mavbridge.core.provenance import without_secrets
 from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle_thread
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import Camera, FlightOutcome, TickSink
+from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.stopping import HungError, StopRequest, Worker, stop_on_signals
 from mavbridge.core.vehicle import FlightEnd
 from mavbridge.flight.checks import check_flight, output_folders, signing_note
@@ -40,7 +39,6 @@ from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.terminal import STATUS_HZ
-from policy.contract import Contract
 from policy.preprocess import least_source_px
 from policy.protocol import PolicyRunner
 
@@ -106,8 +104,6 @@ def fly_policy(
     ``sinks`` receive every tick. An error that ends a flight of the policy has the exit status of a
     fault.
     """
-    # OpenCV would print its own complaint about a camera before, and instead of, ours.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
     flight: _Flight | None = None
     with ExitStack() as signals:  # handled until the recording and the report are written
@@ -164,10 +160,14 @@ class _Flight:
         contract = runner.contract
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
-        cameras = [
-            self._open_camera(source, contract, console)
-            for source in config.camera.sources_of(contract.cameras)
-        ]
+        cameras = open_cameras(
+            config.camera,
+            contract,
+            image_size=least_source_px(contract),
+            clock=clock,
+            report=lambda line: console.print(Text(line)),
+            stack=stack,
+        )
         caches = [FeatureCache(span_ns=past_ns) for _ in cameras]
         self._observers.open_viewer(stack)
         self._observers.open_recorder(guard, lambda: self._view.status.autopilot)
@@ -211,21 +211,6 @@ class _Flight:
             end = referee.end
         status, is_current = self._view.status, summary is not None
         return referee.outcome(end, status, asked.reason, is_current=is_current)
-
-    def _open_camera(self, source: str, contract: Contract, console: Console) -> Camera:
-        config = self._config.camera
-        camera = open_camera(
-            source,
-            image_size=least_source_px(contract),
-            clock=self._clock,
-            timeout_s=config.camera_timeout,
-            latency_ms=config.camera_latency,
-            report=lambda line: console.print(Text(line)),
-            is_depth=contract.is_depth,
-        )
-        self._stack.callback(camera.close)
-        _log.debug("camera %s is open", without_secrets(source))
-        return camera
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""

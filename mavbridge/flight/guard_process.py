@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import SocketAddress
@@ -260,16 +261,24 @@ def _spawn(
     )
 
 
-def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> GuardProcess:
-    """Start the guard process. Closing ``stack`` closes its channel, which ends it."""
+def start_guard(
+    config: FlyConfig, clock: Clock, stack: ExitStack, *, pilot_hz: float | None = None
+) -> GuardProcess:
+    """Start the guard process. Closing ``stack`` closes its channel, which ends it.
+
+    ``pilot_hz``: rate of a pilot's sticks, recorded with all packets while none of ours is sent.
+    """
+    link = link_settings(config, config.rates.loops(is_dual=config.policy.may_be_dual))
+    if pilot_hz is not None:
+        link = replace(link, pilot_hz=pilot_hz, stick_hz=0.0)
     tlog_pipe = None if config.record is None else open_tlog_pipe()
     if tlog_pipe is not None:
         stack.callback(tlog_pipe.close)
     settings = GuardSettings(
-        link=link_settings(config, config.rates.loops(is_dual=config.policy.may_be_dual)),
+        link=link,
         realtime=config.rates.realtime,
         tlog_fd=None if tlog_pipe is None else tlog_pipe.writer.fileno(),
-        keeps_packets=tlog_pipe is not None,
+        keeps_packets=tlog_pipe is not None or pilot_hz is not None,
         wall_offset_ns=wall_offset_ns(clock),
     )
     guard = GuardProcess(settings, clock)

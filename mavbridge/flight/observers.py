@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
-from mavbridge.core.course import read_gates
+from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import as_json
 from mavbridge.core.observers import ObserverThread
@@ -31,7 +31,7 @@ from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_document
-from mavbridge.recording.folder import FlightMeta, remove_flight, write_meta
+from mavbridge.recording.folder import FlightMeta, FlightSource, remove_flight, write_meta
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
@@ -45,6 +45,57 @@ SCREEN_CLOSE_S = 2.0
 RECORDER_JOIN_S = 60.0
 """Longest wait for the recorder. A long flight's tables become Parquet within seconds; the vehicle
 is released by then."""
+
+
+def flight_meta(
+    plan: FlightPlan, source: FlightSource, start_ns: int, wall_offset_ns: int
+) -> FlightMeta:
+    """Return the facts that are known before a flight starts, those of a policy left out."""
+    names = plan.contract.cameras
+    sources = map(without_secrets, plan.config.camera.sources_of(names))
+    return FlightMeta(
+        started_at=datetime.fromtimestamp((start_ns + wall_offset_ns) / NS_PER_S, UTC).isoformat(),
+        start_ns=start_ns,
+        source=source,
+        policy=None,
+        engine=None,
+        mode="dual" if plan.is_dual else "single",
+        action_hz=plan.loops.action_hz,
+        visual_hz=plan.image_rates_hz[0],
+        contract=plan.contract,
+        command=command_line(),
+        versions=versions(),
+        git_revision=git_revision(),
+        cameras=dict(zip(names, sources, strict=True)),
+    )
+
+
+def open_viewer(
+    plan: FlightPlan, stack: ExitStack, *, gates: tuple[CourseGate, ...] = ()
+) -> ObserverThread | None:
+    """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
+    target, contract, freshness = plan.config.rerun, plan.contract, plan.guard.freshness
+    if target == "off":
+        return None
+    from mavbridge.observe.viewer import RerunView  # takes 0.4 s
+    from mavbridge.observe.viewer_layout import ViewedFlight
+
+    flight = ViewedFlight(
+        vision_hz=plan.image_rates_hz[0],
+        chunk_hz=plan.loops.action_hz,
+        stick_hz=plan.config.rates.stick_rate,
+        contract=contract,
+        max_state_age_ns=freshness.state_ns,
+        max_feature_age_ns=freshness.feature_ns,
+        to_ned=ActionFrame(contract).to_guard,
+        gates=gates,
+    )
+    viewer = ObserverThread(
+        "mavbridge-rerun", capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
+    )
+    viewer.start(RerunView(target, flight, is_live=True))
+    stack.callback(viewer.close, VIEWER_JOIN_S)
+    return viewer
 
 
 class FlightObservers:
@@ -89,28 +140,7 @@ class FlightObservers:
 
     def open_viewer(self, stack: ExitStack) -> None:
         """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
-        if self._config.rerun == "off":
-            return
-        from mavbridge.observe.viewer import RerunView  # takes 0.4 s
-        from mavbridge.observe.viewer_layout import ViewedFlight
-
-        config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
-        flight = ViewedFlight(
-            vision_hz=self._plan.image_rates_hz[0],
-            chunk_hz=self._plan.loops.action_hz,
-            stick_hz=config.rates.stick_rate,
-            contract=contract,
-            max_state_age_ns=freshness.state_ns,
-            max_feature_age_ns=freshness.feature_ns,
-            to_ned=ActionFrame(contract).to_guard,
-            gates=self._gates or (),
-        )
-        viewer = ObserverThread(
-            "mavbridge-rerun", capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
-        )
-        viewer.start(RerunView(config.rerun, flight, is_live=True))
-        stack.callback(viewer.close, VIEWER_JOIN_S)
-        self._viewer = viewer
+        self._viewer = open_viewer(self._plan, stack, gates=self._gates or ())
 
     def open_recorder(self, guard: GuardProcess, autopilot: Callable[[], str]) -> None:
         """Start the recorder if --record is given.
@@ -123,24 +153,13 @@ class FlightObservers:
         from mavbridge.recording.recorder import Recorder
         from mavbridge.recording.replay_files import ReplaySettings
 
-        start_ns, offset_ns = self._clock.now_ns(), self._wall_offset_ns
-        meta = FlightMeta(
-            started_at=datetime.fromtimestamp((start_ns + offset_ns) / NS_PER_S, UTC).isoformat(),
-            start_ns=start_ns,
-            source="flight",
+        meta = replace(
+            flight_meta(self._plan, "flight", self._clock.now_ns(), self._wall_offset_ns),
             policy=self._runner.name,
             engine=self._runner.engine,
-            mode=self._mode,
-            action_hz=self._plan.loops.action_hz,
-            visual_hz=self._plan.image_rates_hz[0],
-            contract=self._runner.contract,
             seed=self._config.policy.seed,
             plan=self._plan.figures(),
-            command=command_line(),
-            versions=versions(),
-            git_revision=git_revision(),
             policy_files=digests(policy_files(self._config.policy)),
-            cameras=self._camera_sources(),
         )
         self._guard, recorder = guard, Recorder(cameras=len(meta.contract.cameras))
         try:
@@ -151,7 +170,7 @@ class FlightObservers:
                 packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
                 autopilot=autopilot,
                 report=self.screen.show_message,
-                settings=ReplaySettings(config=self._config, wall_offset_ns=offset_ns),
+                settings=ReplaySettings(config=self._config, wall_offset_ns=self._wall_offset_ns),
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error
@@ -174,11 +193,6 @@ class FlightObservers:
             write_meta(folder, meta)
         except OSError as error:
             self.screen.show_message(f"--record {folder}: {error.strerror}")
-
-    def _camera_sources(self) -> dict[str, str]:
-        names = self._runner.contract.cameras
-        sources = map(without_secrets, self._config.camera.sources_of(names))
-        return dict(zip(names, sources, strict=True))
 
     def finish(
         self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None

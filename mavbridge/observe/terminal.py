@@ -222,8 +222,8 @@ class FlightScreen(MessageScreen):
             line.append(f"  {name} ")
             line.append(f"{number(rate_hz, 1)} Hz", style=rate_style(rate_hz, target_hz))
         attitude_ns = None if tick.state is None else tick.state.attitude_ns
-        line.append(f"  feature {_age(tick.sent_ns, tick.feature_captured_ns)}")
-        line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
+        line.append(f"  feature {age(tick.sent_ns, tick.feature_captured_ns)}")
+        line.append(f"  state {age(tick.sent_ns, attitude_ns)}")
         line.append(f"  missed {self._missed_slots}")
         if tick.release_reason is not None:  # last: it can be long, and is cut first
             line.append(f"  {without_secrets(str(tick.release_reason))}", style="yellow")
@@ -264,7 +264,8 @@ class FlightScreen(MessageScreen):
             self._console.print(line, soft_wrap=True)
 
 
-def _age(now_ns: int, stamp_ns: int | None) -> str:
+def age(now_ns: int, stamp_ns: int | None) -> str:
+    """Return the age of a stamp in milliseconds, for the status line."""
     age_ms = None if stamp_ns is None else (now_ns - stamp_ns) / NS_PER_MS
     return f"{number(age_ms, 0)} ms"
 

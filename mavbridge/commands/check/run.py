@@ -7,8 +7,6 @@ from multiprocessing import TimeoutError as PoolTimeoutError
 from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
-
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.commands.check.policy import check_policy
@@ -44,7 +42,6 @@ def check(config: CheckConfig) -> int:
     is_on_stdout = config.json == STDOUT
     if not is_on_stdout:
         require_writable(config.json, "--json")
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     flight, clock = config.flight, MonotonicClock()
     if flight.policy.policy != NO_POLICY:
         print_status(f"loading the policy, then running it for {config.timing:g} s")

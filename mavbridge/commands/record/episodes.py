@@ -1,6 +1,7 @@
 """Start and end of episodes, their folders, recorders and marks, and the room on the disk."""
 
 import os
+import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,10 +9,13 @@ from pathlib import Path
 from shutil import disk_usage
 from typing import Literal, TypeAlias
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
+from mavbridge.core.vehicle import ForwardedPacket, Packet
+from mavbridge.flight.observers import flight_meta
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
 from mavbridge.recording.recorder import Recorder
@@ -150,31 +154,25 @@ class Episode:
 
 
 class Episodes:
-    """Begins, ends and marks episodes. Everything except ``emit`` is for one thread."""
+    """Begins, ends and marks episodes. Everything is for one thread, except ``emit`` and
+    ``watch_packets``."""
 
     def __init__(
         self,
         out: Path,
+        plan: FlightPlan,
         *,
         clock: Clock,
-        make_meta: Callable[[int], FlightMeta],
-        log_to: Callable[[PacketPipe | None], None],
         autopilot: Callable[[], str],
-        wall_offset_ns: int,
         report: Callable[[str], None],
     ) -> None:
-        """Record below ``out``, where earlier episodes are kept.
-
-        ``make_meta`` gets the stamp of an episode's start; ``log_to`` sends the vehicle's packets
-        to a log from then on, or nowhere; ``report`` is called by any thread.
-        """
+        """Record below ``out``, where earlier episodes are kept; any thread calls ``report``."""
         self._out = out
+        self._plan = plan
         self._clock = clock
-        self._make_meta = make_meta
-        self._log_to = log_to
         self._autopilot = autopilot
-        self._wall_offset_ns = wall_offset_ns
         self._report = report
+        self._log_lock = threading.Lock()
         self._recorded: Episode | None = None
         """Episode that takes events: the current one, and before that while its recorder begins."""
         self.current: Episode | None = None
@@ -186,6 +184,13 @@ class Episodes:
         """Record the event if an episode is in progress; a ``TickSink``."""
         if (episode := self._recorded) is not None:
             episode.emit(event)
+
+    def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
+        """Log the vehicle's packets if an episode is in progress."""
+        with self._log_lock:
+            if (episode := self.current) is not None:
+                for packet in packets:
+                    episode.log.put(Packet(packet.arrived_ns, packet.data))
 
     @property
     def number(self) -> int:
@@ -205,17 +210,18 @@ class Episodes:
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder, "--out")
-        begin_ns, recorder = self._clock.now_ns(), Recorder()
+        begin_ns, offset_ns = self._clock.now_ns(), wall_offset_ns(self._clock)
+        recorder = Recorder()
         try:
             pipe = open_tlog_pipe()
-            log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=self._wall_offset_ns)
+            log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=offset_ns)
             pipe.writer.close()
             episode = self._recorded = Episode(
                 folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
             )
             recorder.begin(
                 folder,
-                self._make_meta(begin_ns),
+                flight_meta(self._plan, "pilot", begin_ns, offset_ns),
                 tlog_pipe=pipe,
                 packets_dropped=lambda: log.dropped,
                 autopilot=self._autopilot,
@@ -223,7 +229,6 @@ class Episodes:
             )
         except OSError as error:
             raise UserError(f"{folder}: {error}") from error
-        self._log_to(log)
         self.current = episode
         self._next += 1
 
@@ -233,8 +238,8 @@ class Episodes:
         if episode is None:
             return
         seconds = (self._clock.now_ns() - episode.begin_ns) / NS_PER_S
-        self._log_to(None)
-        episode.log.close()
+        with self._log_lock:
+            episode.log.close()
         episode.recorder.close(CLOSE_S)
         self._last = episode
         self._keep_mark(episode)

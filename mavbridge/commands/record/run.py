@@ -3,14 +3,14 @@
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import replace
-from datetime import UTC, datetime
+from functools import partial
 
 import cv2
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.camera.open import check_camera, open_camera, require_present
+from mavbridge.camera.open import check_camera, open_cameras, require_present
 from mavbridge.commands.config import RecordConfig
 from mavbridge.commands.record.episodes import (
     KEYS,
@@ -22,41 +22,28 @@ from mavbridge.commands.record.episodes import (
     disk_left_gb,
     prepare_out,
 )
-from mavbridge.commands.record.view import (
-    CONTRACT,
-    STICKS_FRESH_NS,
-    PilotView,
-    RecordScreen,
-    session_status,
-)
-from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.commands.record.view import CONTRACT, PilotView, RecordScreen, session_status
+from mavbridge.config.flight import EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import Rates
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
+from mavbridge.core.address import parse_address
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
-from mavbridge.core.observers import FanOut, ObserverThread
-from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
+from mavbridge.core.observers import FanOut
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import Camera, TickSink
 from mavbridge.core.stopping import StopRequest, Worker, stop_on_signals
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.guard_process import GuardProcess
+from mavbridge.flight.guard_process import start_guard
+from mavbridge.flight.observers import open_viewer
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.settings import link_settings
 from mavbridge.flight.vision_loop import vision_loops
-from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest
-from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import patient_console
-from mavbridge.observe.viewer import RerunView
-from mavbridge.observe.viewer_layout import ViewedFlight
-from mavbridge.recording.folder import FlightMeta
 
 STEP_S = 0.05
 MAX_KEYS = 64
 """Capacity of the queue of keys for the next step; the oldest are dropped first."""
 JOIN_S = 2.0
-RERUN_CAPACITY = 1000
 DISK_NS = NS_PER_S
 """Time between two checks of the disk."""
 GUARD_END_S = 5.0
@@ -66,12 +53,11 @@ NOTHING = np.zeros((1, 1), np.float32)
 def record(config: RecordConfig) -> int:
     """Record until the user, a signal or a full disk ends it; return the exit status."""
     clock = MonotonicClock()
-    make_transport(config.vehicle.connect, clock)
+    parse_address(config.vehicle.connect)
     (source,) = config.camera.sources
     check_camera(source, latency_ms=config.camera.camera_latency)
     require_present(source)
     prepare_out(config.out)
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
     with ExitStack() as signals, ExitStack() as stack:  # signals: handled until all is closed
         session = _Session(config, clock, patient_console(), stack)
@@ -81,25 +67,17 @@ def record(config: RecordConfig) -> int:
 
 def pilot_flight(config: RecordConfig) -> FlyConfig:
     """Return a flight without a policy that only listens, at the rates of the recording."""
-    rates = Rates(
-        action_rate=config.rate,
-        stick_rate=config.rate,
-        visual_rate=config.visual_rate,
-        realtime=False,
-    )
-    link = LinkConfig(**vars(config.vehicle), readonly=True)
-    return FlyConfig(link=link, camera=config.camera, rates=rates)
-
-
-def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
-    """Return settings of a guard that requests the pilot's sticks at the rate of the recording."""
-    flight = pilot_flight(config)
-    link = link_settings(flight, flight.rates.loops(is_dual=True))
-    return GuardSettings(
-        link=replace(link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0),
-        realtime=False,
-        keeps_packets=True,
-        wall_offset_ns=wall_offset_ns(clock),
+    return FlyConfig(
+        link=LinkConfig(**vars(config.vehicle), readonly=True),
+        camera=replace(config.camera, camera=config.camera.sources),  # under no name but ours
+        rates=Rates(
+            action_rate=config.rate,
+            stick_rate=config.rate,
+            visual_rate=config.visual_rate,
+            realtime=False,
+        ),
+        envelope=EnvelopeConfig(min_battery=0.0),
+        rerun=config.rerun,
     )
 
 
@@ -119,31 +97,42 @@ class _Session:
         self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
-        self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.visual_rate)
+        self._screen = RecordScreen(
+            console, action_hz=config.rate, vision_hz=config.visual_rate, readonly=True
+        )
         stack.callback(self._screen.close, JOIN_S)
-        viewer = () if config.rerun == "off" else (self._open_viewer(),)
-        self._guard = GuardProcess(listening_guard(config, clock), clock)
-        stack.callback(self._guard.close)
+        plan = plan_flight(pilot_flight(config), CONTRACT, is_dual=True)
+        viewer = open_viewer(plan, stack)
+        self._guard = start_guard(plan.config, clock, stack, pilot_hz=config.rate)
         self._guard.wait_until_open()
-        camera = self._open_camera(console)
+        cameras = open_cameras(
+            plan.config.camera,
+            CONTRACT,
+            image_size=(config.camera_size, config.camera_size),
+            clock=clock,
+            report=lambda line: console.print(Text(line)),
+            stack=stack,
+        )
         self._episodes = Episodes(
             config.out,
+            plan,
             clock=clock,
-            make_meta=self._meta,
-            log_to=lambda log: self._view.log_to(log),
             autopilot=lambda: self._view.status.autopilot,
-            wall_offset_ns=wall_offset_ns(clock),
             report=self._screen.show_message,
         )
-        sink = FanOut((self._screen, self._episodes, *viewer))
-        plan = plan_flight(pilot_flight(config), CONTRACT, is_dual=True)
-        self._view = PilotView(plan, sink=sink, samples=self._guard.samples)
+        sink = FanOut(filter(None, (self._screen, self._episodes, viewer)))
+        self._view = PilotView(
+            plan,
+            sink=sink,
+            samples=self._guard.samples,
+            watch_packets=self._episodes.watch_packets,
+        )
         self._images = FeatureCache()
         (self._vision,) = vision_loops(  # encodes nothing, but paces, stamps and judges the images
             plan,
             self._view,
             encode=lambda _image, _camera: NOTHING.copy(),
-            cameras=[camera],
+            cameras=cameras,
             caches=[self._images],
             clocks=[clock],
             sinks=[sink],
@@ -151,50 +140,10 @@ class _Session:
         )
         self._guard.send(plan.guard)
 
-    def _open_camera(self, console: Console) -> Camera:
-        wanted = self._config.camera
-        camera = open_camera(
-            wanted.sources[0],
-            image_size=(self._config.camera_size, self._config.camera_size),
-            clock=self._clock,
-            timeout_s=wanted.camera_timeout,
-            latency_ms=wanted.camera_latency,
-            report=lambda line: console.print(Text(line)),
-            is_depth=False,
-        )
-        self._stack.callback(camera.close)
-        return camera
-
-    def _open_viewer(self) -> TickSink:
-        rate = self._config.rate
-        flight = ViewedFlight(vision_hz=self._config.visual_rate, chunk_hz=rate, stick_hz=rate)
-        viewer = ObserverThread("mavbridge-rerun", capacity=RERUN_CAPACITY)
-        viewer.start(RerunView(self._config.rerun, flight, is_live=True))
-        self._stack.callback(viewer.close, JOIN_S)
-        return viewer
-
-    def _meta(self, begin_ns: int) -> FlightMeta:
-        wall_s = (begin_ns + wall_offset_ns(self._clock)) / NS_PER_S
-        return FlightMeta(
-            started_at=datetime.fromtimestamp(wall_s, UTC).isoformat(),
-            start_ns=begin_ns,
-            source="pilot",
-            policy=None,
-            engine=None,
-            mode="dual",
-            action_hz=self._config.rate,
-            visual_hz=self._config.visual_rate,
-            contract=CONTRACT,
-            command=command_line(),
-            versions=versions(),
-            git_revision=git_revision(),
-            cameras={"front": without_secrets(self._config.camera.sources[0])},
-        )
-
     def run(self, stop: StopRequest) -> None:
         """Follow orders until one of them, a signal, a worker's death or the disk ends it."""
         vision = Worker("mavbridge-vision", self._vision.run)
-        listener = Worker("mavbridge-guard", lambda ended: self._guard.listen(ended, self._view))
+        listener = Worker("mavbridge-guard", partial(self._guard.listen, view=self._view))
         for worker in (vision, listener):
             self._stack.callback(worker.join, JOIN_S)
             worker.start()
@@ -241,7 +190,6 @@ class _Session:
             self._episodes.end("a key")
             return False
         self._follow()
-        self._screen.sticks.set(self._view.stick_packets, self._view.sticks_ns)
         self._screen.shown = session_status(
             self._episodes,
             now_ns=self._clock.now_ns(),
@@ -278,16 +226,17 @@ class _Session:
 
     def _missing(self) -> str | None:
         """Return the requirement of a demonstration that is missing, or None."""
-        if self._view.status.mode is None:
+        status = self._view.status
+        if status.mode is None:
             return "no vehicle yet"
         if self._view.telemetry.ned_from_body_wxyz is None:
             return "no attitude from the vehicle"
         if self._view.telemetry.velocity_ned_mps is None:
             return "no velocity from the vehicle: it has no position estimate"
-        if self._clock.now_ns() - self._view.sticks_ns > STICKS_FRESH_NS:
-            return "no sticks of a pilot: is the transmitter on?"
-        if self._view.status.rc_sticks is None:
+        if status.rc_sticks is None and any(status.rc_channels_us):
             return f"the pilot's sticks cannot be read ({self._view.reason})"
+        if status.rc_sticks is None:
+            return "no sticks of a pilot: is the transmitter on?"
         return None
 
     def _doubt(self) -> str | None:

@@ -6,14 +6,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from helpers.factories import make_tick
-from helpers.fakes import FakeClock
-from helpers.recordings import make_frame, make_meta
+from helpers.factories import make_plan, make_tick
+from helpers.fakes import START_NS, FakeClock
+from helpers.recordings import make_frame
 from mavbridge.commands.record import episodes
 from mavbridge.commands.record.episodes import Episodes, disk_left_gb, prepare_out
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.codec.tlog import PacketPipe
+from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.video_writer import WriterDiedError
@@ -27,30 +26,26 @@ class Stand:
 
     out: Path
     told: list[str] = field(default_factory=list)
-    log: PacketPipe | None = None
 
     def __post_init__(self) -> None:
         self.episodes = Episodes(
             self.out,
+            make_plan(),
             clock=FakeClock(),
-            make_meta=lambda begin_ns: make_meta(start_ns=begin_ns, source="pilot"),
-            log_to=self._log_to,
             autopilot=lambda: "ardupilot 4.7.0",
-            wall_offset_ns=0,
             report=self.told.append,
         )
 
-    def _log_to(self, log: PacketPipe | None) -> None:
-        self.log = log
-
     def record(self, first: int, count: int = 3, **changes: object) -> None:
         """One episode of ticks and frames whose numbers begin at ``first``."""
+        self.episodes.watch_packets((ForwardedPacket(START_NS, START_NS, b"early"),))
         self.episodes.begin()
-        self.log.put(Packet(0, PACKET))
+        self.episodes.watch_packets((ForwardedPacket(START_NS, START_NS, PACKET),))
         for number in range(first, first + count):
             self.episodes.emit(make_tick(number, **changes))
             self.episodes.emit(make_frame(number))
         self.episodes.end("a key")
+        self.episodes.watch_packets((ForwardedPacket(START_NS, START_NS, b"late"),))
 
     def flight(self, number: int) -> RecordedFlight:
         return open_flight(self.out / f"episode-{number:04}")
@@ -74,10 +69,9 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
         assert (flight.meta.ticks, flight.meta.frames) == (3, 3)
         assert (flight.meta.ticks_dropped, flight.meta.frames_dropped) == (0, 0)
         assert flight.meta.success is None
-        assert (flight.folder / "link.tlog").read_bytes().endswith(PACKET)
+        assert (flight.folder / "link.tlog").read_bytes()[8:] == PACKET
     assert [row.tick.index for row in stand.flight(2).tick_rows()] == [40, 41, 42]
     assert stand.episodes.counts.total() == 2
-    assert stand.log is None, "no packet goes into the log of an episode that has ended"
 
 
 def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
