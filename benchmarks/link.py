@@ -37,8 +37,9 @@ class LinkClient(NamedTuple):
     """With {port} for its UDP port."""
 
 
-# No smoothing, so that the vehicle finds its code unchanged. Its attitude never changes. Chunks at
-# twice its rate, so that an attitude closely after a late one is answered at once.
+# No smoothing and no mapping, so that the vehicle finds its code unchanged. Its attitude never
+# changes. Chunks at twice its rate, so that an attitude closely after a late one is answered at
+# once.
 OUR_CLIENT = LinkClient(
     "mavbridge",
     (
@@ -47,6 +48,7 @@ OUR_CLIENT = LinkClient(
         *("--camera", "none", "--arm", "--on-fault", "release", "--then", "release"),
         *("--set-config", "limits.tau=0", "--set-config", "limits.slew=0"),
         *("--set-config", "limits.frozen_state=0", "--set-config", "rates.action=200"),
+        *("--set-config", "link.raw_sticks=true"),
     ),
 )
 BARE_CLIENT = LinkClient(

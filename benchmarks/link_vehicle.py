@@ -1,14 +1,14 @@
-"""Vehicle of the link test: always armed; times the answers to its attitudes.
+"""Vehicle of the link test: times the answers to its attitudes.
 
-It sends ATTITUDE_QUATERNION on a grid, each with a code in its roll rate, and waits for sticks with
-the same code: RC_CHANNELS_OVERRIDE (channel 1) or MANUAL_CONTROL (y). A client's other needs
-(heartbeat, parameters, acknowledgements, other state messages) are sent half a period away from the
-attitude, so that they never delay it. Sends are stamped just before the system call, answers on
-arrival by the kernel, so that this process adds nothing to the figures.
+It is the simulated ArduPilot, armed and at a standstill in the air: its physics never steps. It
+sends ATTITUDE_QUATERNION on a grid, each with a code in its roll rate, and waits for sticks with
+the same code: RC_CHANNELS_OVERRIDE (channel 1) or MANUAL_CONTROL (y). All else that a client asks
+for is sent half a period away from the attitude, so that it never delays it. Sends are stamped just
+before the system call, answers on arrival by the kernel, so that this process adds nothing to the
+figures.
 """
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import count
 from pathlib import Path
@@ -16,10 +16,15 @@ from pathlib import Path
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.mavlink.transport.sockets import UdpTransport
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.params import ArduPilotParams
+from sitl.ardupilot.server import ArduPilotServer
+from sitl.report import FlightLog
+from sitl.vehicle.config import MID_RECEIVER_US, VehicleConfig
 
 ATTITUDE_HZ = 97.0
 """Not 100, so that the phase relative to a client with a 100 Hz clock takes every value."""
@@ -32,31 +37,17 @@ WARM_ANSWERS = 100
 CONNECT_S = 30.0
 PENDING_LIMIT = 150
 """Largest number of pending answers (1.5 s); older ones count as lost. Smaller than CODES."""
-SENT_MESSAGES = (
-    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+READY_NS = 10 * NS_PER_S
+"""Age of the vehicle at the start: its estimator has a position."""
+STREAM_US = 10_000
+"""Interval of the other messages that every client gets."""
+STREAMS = (
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     mav.MAVLINK_MSG_ID_RAW_IMU,
     mav.MAVLINK_MSG_ID_RC_CHANNELS,
 )
-"""Messages whose interval may be set; others are denied."""
-PARAMS = {
-    "RCMAP_ROLL": 1.0,
-    "RCMAP_PITCH": 2.0,
-    "RCMAP_THROTTLE": 3.0,
-    "RCMAP_YAW": 4.0,
-    "RC_OVERRIDE_TIME": 3.0,
-    "RC_OPTIONS": 32.0,
-    "FS_THR_ENABLE": 1.0,
-    "FS_THR_VALUE": 975.0,
-    "MAV_GCS_SYSID": 255.0,
-    "MAV_GCS_SYSID_HI": 255.0,
-    "SYSID_MYGCS": 255.0,
-} | {
-    f"RC{channel}_{part}": value
-    for channel in range(1, 5)
-    for part, value in (("MIN", 1000.0), ("TRIM", 1500.0), ("MAX", 2000.0), ("REVERSED", 0.0))
-}
-"""All parameters that a client may request; RCn_OPTION stays unanswered."""
+ATTITUDES = (mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mav.MAVLINK_MSG_ID_ATTITUDE)
+"""Not streamed, although a client asks for them."""
 app = App(help=__doc__)
 
 
@@ -77,13 +68,8 @@ def stick_of(code: int) -> float:
     return (code - CODE_SPAN) / CODE_SPAN
 
 
-def code_of(stick: float) -> int:
-    """Inverse of ``stick_of``."""
-    return round(stick * CODE_SPAN) + CODE_SPAN
-
-
 def code_of_pwm(pwm_us: int) -> int:
-    """Return the code in a channel of RC_CHANNELS_OVERRIDE."""
+    """Return the code in the pulse width of the roll stick."""
     return round((pwm_us - 1000) / CODE_US)
 
 
@@ -145,10 +131,17 @@ class LinkVehicle:
     def __init__(self, transport: UdpTransport, clock: Clock) -> None:
         self._clock = clock
         self._transport = transport
-        self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=1)
-        self._mav.robust_parsing = True
         self._start_ns = clock.now_ns()
-        self._channels_us = [1500] * 8
+        config = VehicleConfig(receiver_us=MID_RECEIVER_US)
+        params, boot_ns = ArduPilotParams(config), self._start_ns - READY_NS
+        params.set("MAV_GCS_SYSID", 1.0)  # sticks of any sender count: MAVSDK's is not ours
+        params.set("MAV_GCS_SYSID_HI", 255.0)
+        self._ap = ArduCopter(params, config, boot_ns)
+        self._ap.launch((0.0, 0.0, -10.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        self._server = ArduPilotServer(self._ap, 1, FlightLog(boot_ns, None))
+        (self._endpoint,) = self._server.links
+        for message_id in STREAMS:
+            self._endpoint.set_interval(message_id, STREAM_US)
         self._round_trips = RoundTrips()
 
     def run(self, attitudes: int) -> LinkLatency:
@@ -176,68 +169,24 @@ class LinkVehicle:
         """
         half_ns = round(NS_PER_S / ATTITUDE_HZ / 2)
         self._clock.sleep_until_ns(due_ns)
-        code = number % CODES
-        data = self._pack(
-            mav.MAVLink_attitude_quaternion_message(
-                self._boot_ms(), 1.0, 0.0, 0.0, 0.0, stick_of(code), 0.0, 0.0
-            )
-        )
+        ap, code = self._ap, number % CODES
+        ap.now_ns = self._clock.now_ns()
+        ap.sensed = ap.sensed._replace(rate_body_radps=(stick_of(code), 0.0, 0.0))
+        self._endpoint.send_now(mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
+        data = self._endpoint.take_outgoing()
         self._round_trips.send(code, self._clock.now_ns())
         self._transport.send(data)
         self._clock.sleep_until_ns(due_ns + half_ns)
-        for chunk in self._transport.drain():
-            for message in self._mav.parse_buffer(chunk.data) or ():
-                self._receive(message, chunk.arrived_ns)
-        self._transport.send(b"".join(map(self._pack, self._telemetry(number))))
+        for datagram, arrived_ns, _ in self._transport.drain():
+            self._server.receive(0, datagram, arrived_ns)
+            ap.rc.update(arrived_ns)
+            self._round_trips.answer(code_of_pwm(ap.rc.channels_us[0]), arrived_ns)
+        for message_id in ATTITUDES:
+            self._endpoint.set_interval(message_id, -1)
+        ap.now_ns = self._clock.now_ns()
+        self._server.step(ap.now_ns)
+        self._transport.send(self._endpoint.take_outgoing())
         return due_ns + 2 * half_ns
-
-    def _receive(self, message: mav.MAVLink_message, arrived_ns: int) -> None:
-        name = message.get_type()
-        if name == "RC_CHANNELS_OVERRIDE":
-            self._channels_us[:4] = [getattr(message, f"chan{k}_raw") for k in range(1, 5)]
-            self._round_trips.answer(code_of_pwm(message.chan1_raw), arrived_ns)
-        elif name == "MANUAL_CONTROL":
-            self._round_trips.answer(code_of(message.y / 1000), arrived_ns)
-        elif name == "COMMAND_LONG":
-            is_denied = (
-                message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL
-                and message.param1 not in SENT_MESSAGES
-            )
-            result = mav.MAV_RESULT_DENIED if is_denied else mav.MAV_RESULT_ACCEPTED
-            self._transport.send(
-                self._pack(mav.MAVLink_command_ack_message(message.command, result))
-            )
-        elif name == "PARAM_REQUEST_READ" and message.param_id in PARAMS:
-            value, kind = PARAMS[message.param_id], mav.MAV_PARAM_TYPE_REAL32
-            reply = mav.MAVLink_param_value_message(
-                message.param_id.encode(), value, kind, len(PARAMS), 0
-            )
-            self._transport.send(self._pack(reply))
-
-    def _telemetry(self, number: int) -> Iterator[mav.MAVLink_message]:
-        boot_ms = self._boot_ms()
-        yield mav.MAVLink_local_position_ned_message(boot_ms, 0.0, 0.0, -10.0, 0.0, 0.0, 0.0)
-        yield mav.MAVLink_raw_imu_message(boot_ms * 1000, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
-        if number % 2 == 0:
-            channels_us = (*self._channels_us, *[0] * 10)
-            yield mav.MAVLink_rc_channels_message(boot_ms, 8, *channels_us, 255)
-        if number % round(ATTITUDE_HZ) == 0:
-            yield mav.MAVLink_heartbeat_message(
-                mav.MAV_TYPE_QUADROTOR,
-                mav.MAV_AUTOPILOT_ARDUPILOTMEGA,
-                mav.MAV_MODE_FLAG_SAFETY_ARMED | mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
-                mav.COPTER_MODE_ALT_HOLD,
-                mav.MAV_STATE_ACTIVE,
-                3,
-            )
-
-    def _boot_ms(self) -> int:
-        return (self._clock.now_ns() - self._start_ns) // NS_PER_MS
-
-    def _pack(self, message: mav.MAVLink_message) -> bytes:
-        data: bytes = message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) % 256
-        return data
 
 
 if __name__ == "__main__":
