@@ -73,9 +73,10 @@ def param_rows(terms: Terms) -> Iterator[CheckRow]:
     if (cause := terms.assessment.unusable) is not None:
         unusable = because(Code.CALIBRATION_UNUSABLE, cause=cause)
         notes.append(ParamNote("obstacle", (), str(unusable)))
-    wanted = terms.profile.wanted_params(terms.values, terms.assessment.context)
+    wanted = {note.names[0]: note.said for note in notes if note.kind == "wanted"}
     rows: dict[str, list[ParamNote]] = {name: [] for name in wanted}
-    for note in sorted(notes, key=lambda note: note.kind not in _REFUSED):
+    remarks = [note for note in notes if note.kind != "wanted"]
+    for note in sorted(remarks, key=lambda note: note.kind not in _REFUSED):
         own = note.names[0] if note.names else "settings"
         rows.setdefault(next((name for name in wanted if name in note.names), own), []).append(note)
     for name, about in rows.items():

@@ -159,30 +159,6 @@ class ArduPilot(Profile):
         elif context.output is not None:
             yield from _setpoint_notes(values, context)
 
-    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
-        """See `Profile`."""
-        if context.output == "rc-override":
-            switch = self.traits(values).override_switch
-            return {
-                "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID": (
-                    f"{context.source_system}, our system id"
-                ),
-                "RC_OPTIONS": "bit 1 clear",
-                "RC_OVERRIDE_TIME": f"0.5; above 0, at most {LONGEST_S:g} s",
-                **dict.fromkeys(SIMPLE_NAMES, "0"),
-                "FS_THR_ENABLE": "not 0" if context.has_receiver else "not 0, without a receiver",
-                "FS_OPTIONS": "any" if context.has_receiver else "24 (bit 3 set)",
-            } | ({} if switch is None else {f"RC{switch}_OPTION": "46, with its switch on"})
-        wanted = {
-            "GUID_TIMEOUT": f"0.5; at most {LONGEST_S:g} s",
-            "FS_THR_ENABLE": "not 0" if context.has_receiver else "0",
-        }
-        if context.output in ("attitude", "rates"):
-            wanted["GUID_OPTIONS"] = "bit 3 (8) set"
-            is_boosted = context.output == "attitude"
-            wanted["ATC_ANGLE_BOOST"] = "1, or as in training" if is_boosted else "any"
-        return wanted
-
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
@@ -198,8 +174,9 @@ def _override_notes(
     values: Mapping[str, float], context: ParamContext, switch: int | None
 ) -> Iterator[ParamNote]:
     """Yield what ignores, turns or keeps overrides; ``switch``: channel that enables them."""
-    low = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
-    if low is not None:
+    name = "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID"
+    yield ParamNote("wanted", (name,), f"{context.source_system}, our system id")
+    if (low := values.get(name)) is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
         if not low <= context.source_system <= high:
             yield ParamNote(
@@ -209,6 +186,7 @@ def _override_notes(
                 f"--set-config link.source_system={low:.0f}",
                 ", or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)",
             )
+    yield ParamNote("wanted", ("RC_OPTIONS",), "bit 1 clear")
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:
         effect, mended = ", whose bit 1 ignores overrides", options & ~_IGNORE_OVERRIDES
@@ -223,11 +201,14 @@ def _override_notes(
             said = f"the vehicle has not sent {', '.join(missing)}: whether {unknown} is not known"
             yield ParamNote("advice", tuple(missing), said)
     landing = values.get("FS_OPTIONS", _CONTINUE_LANDING)
+    yield ParamNote("wanted", ("FS_OPTIONS",), "any" if context.has_receiver else "24 (bit 3 set)")
     if context.has_receiver is False and not int(landing) & _CONTINUE_LANDING:
         effect = ": without a receiver, a landing turns into RTL when the sticks end"
         mended = int(landing) | _CONTINUE_LANDING
         yield ParamNote.of("hint", "FS_OPTIONS", landing, effect, mended)
-    if context.has_receiver and switch is None:
+    if switch is not None:
+        yield ParamNote("wanted", (f"RC{switch}_OPTION",), "46, with its switch on")
+    elif context.has_receiver:
         yield ParamNote(
             "hint",
             ("RCn_OPTION",),
@@ -239,12 +220,15 @@ def _override_notes(
 def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what ends overrides too early, too late or never."""
     name, time_s = "RC_OVERRIDE_TIME", values.get("RC_OVERRIDE_TIME", 1.0)
+    yield ParamNote("wanted", (name,), f"0.5; above 0, at most {LONGEST_S:g} s")
     if time_s == 0:
         yield ParamNote.of("obstacle", name, time_s, ", which disables overrides", 0.5)
     if time_s < 0:
         why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
         yield ParamNote.of_risk("endless-override", why, name, f"--set {name}=0.5")
     yield from long_timeout(values, name, "hold its last sticks")
+    failsafe = "not 0" if context.has_receiver else "not 0, without a receiver"
+    yield ParamNote("wanted", ("FS_THR_ENABLE",), failsafe)
     if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
         why = because(Code.NO_THROTTLE_FAILSAFE)
         yield ParamNote.of_risk(
@@ -255,6 +239,10 @@ def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterat
 def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what misreads, keeps or weakens setpoints in GUIDED."""
     options = values.get("GUID_OPTIONS")
+    if context.output != "velocity":
+        yield ParamNote("wanted", ("GUID_OPTIONS",), "bit 3 (8) set")
+        boost = "1, or as in training" if context.output == "attitude" else "any"
+        yield ParamNote("wanted", ("ATC_ANGLE_BOOST",), boost)
     if context.output == "velocity":
         if options is not None and int(options) & _NO_VELOCITY:
             effect = ", with which it ignores our velocity to the north and east"
@@ -267,7 +255,9 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
         effect = ", with which it takes our thrust for a climb rate"
         mended = int(options) | _THRUST_AS_THRUST
         yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
+    yield ParamNote("wanted", ("GUID_TIMEOUT",), f"0.5; at most {LONGEST_S:g} s")
     yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
+    yield ParamNote("wanted", ("FS_THR_ENABLE",), "not 0" if context.has_receiver else "0")
     failsafe = values.get("FS_THR_ENABLE", 0.0)
     if context.has_receiver is False and failsafe != 0:
         effect = ": no receiver was seen, and it will not arm without one; setpoints need none"

@@ -180,6 +180,7 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
     time. Simple mode turns by the heading at arming, which is not reported and so cannot be mapped.
     """
     for name, turned_by in zip(SIMPLE_NAMES, ("heading at arming", "way home"), strict=True):
+        yield ParamNote("wanted", (name,), "0")
         if bits := values.get(name, 0):
             note = ParamNote.of("obstacle", name, bits, f": {TURNED}the {turned_by}", 0)
             yield note._replace(turns_sticks=True)

@@ -92,9 +92,10 @@ class EventMeaning(NamedTuple):
     """Text for the user, if no STATUSTEXT reports it."""
 
 
-NoteKind: TypeAlias = Literal["obstacle", "risk", "advice", "hint"]
+NoteKind: TypeAlias = Literal["obstacle", "risk", "advice", "hint", "wanted"]
 """obstacle: the vehicle would not follow our commands, which the user cannot accept. risk: it would
-fly, but not safely. advice: a warning. hint: an improvement, shown only by ``mavbridge check``."""
+fly, but not safely. advice: a warning. hint: an improvement. wanted: the value that a parameter
+should have, in words. Hints and wanted values are shown by ``mavbridge check`` alone."""
 
 
 class ParamNote(NamedTuple):
@@ -279,12 +280,8 @@ class Profile(ABC):
     def notes(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Yield settings that prevent, endanger, weaken or change a flight, each with its remedy.
 
-        Includes risks that the user has accepted.
+        Includes risks that the user has accepted, and what each parameter should be.
         """
-
-    @abstractmethod
-    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
-        """Return the parameters that a flight depends on, with their required values in words."""
 
     @abstractmethod
     def stick_curves(

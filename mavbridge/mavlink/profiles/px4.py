@@ -245,24 +245,6 @@ class Px4(Profile):
                 effect = ": when setpoints end it enters POSCTL if there are sticks, else RTL"
                 yield ParamNote.of("hint", "COM_OBL_RC_ACT", 0, effect, 4, " (land), or 5 (hold)")
 
-    def wanted_params(self, values: Mapping[str, float], context: ParamContext) -> dict[str, str]:
-        """See `Profile`."""
-        time = f"0.5; {_SHORTEST_S:g} to {LONGEST_S:g} s"
-        if context.output == "manual-control":
-            return {
-                "COM_RC_IN_MODE": "1; with a receiver 6 or 8",
-                "COM_RC_LOSS_T": time,
-                "NAV_RCL_ACT": "1, 2 or 3 (hold, return, land)",
-                "COM_RCL_EXCEPT": f"with {_EXCEPT_HOLD} in it",
-                "MAN_ARM_GESTURE": "0",
-                "COM_DISARM_PRFLT": "longer than it takes to lift off",
-            }
-        return {
-            "COM_OF_LOSS_T": time,
-            "COM_OBL_RC_ACT": "4 or 5 (land, hold)",
-            "COM_RCL_EXCEPT": f"with {_EXCEPT_OFFBOARD} in it",
-        }
-
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
@@ -342,6 +324,7 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
     if (time_s := values.get("MAN_KILL_GEST_T", -1.0)) >= 0:
         effect = ": both sticks held down and outwards stop the motors, in flight too"
         yield ParamNote.of("obstacle", "MAN_KILL_GEST_T", time_s, effect, -1)
+    yield ParamNote("wanted", ("COM_RC_IN_MODE",), "1; with a receiver 6 or 8")
     mode = values.get("COM_RC_IN_MODE", 1.0)
     or_else = " (MAVLink only), or 6 with a receiver (MAVLink first; PX4 1.17 and later)"
     if mode in _NO_MAVLINK_STICKS:
@@ -367,6 +350,8 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
         effect = ": in STABILIZED the middle of the throttle is half thrust, not hover thrust"
         yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
+    yield ParamNote("wanted", ("COM_DISARM_PRFLT",), "longer than it takes to lift off")
+    yield ParamNote("wanted", ("MAN_ARM_GESTURE",), "0")
     if values.get("MAN_ARM_GESTURE") == 1:
         effect = ": throttle down and full yaw for a second arms; a policy on the ground might"
         yield ParamNote.of("hint", "MAN_ARM_GESTURE", 1, effect, 0)
@@ -377,6 +362,9 @@ def _end_notes(
 ) -> Iterator[ParamNote]:
     """Yield unexpected effects of the end of our packets, by two parameters."""
     does, is_setpoint = "go on with the last it was told", time == "COM_OF_LOSS_T"
+    yield ParamNote("wanted", (time,), f"0.5; {_SHORTEST_S:g} to {LONGEST_S:g} s")
+    end = "4 or 5 (land, hold)" if is_setpoint else "1, 2 or 3 (hold, return, land)"
+    yield ParamNote("wanted", (action,), end)
     yield from long_timeout(values, time, does, is_setpoint=is_setpoint)
     if (time_s := values.get(time, LONGEST_S)) < _SHORTEST_S:
         effect = ": a pause of our packets as short as that is a failsafe"
@@ -388,6 +376,7 @@ def _end_notes(
 
 def _exception_notes(values: Mapping[str, float], bit: int, mode: str) -> Iterator[ParamNote]:
     """Yield a hint if lost sticks are a failsafe in these modes too."""
+    yield ParamNote("wanted", ("COM_RCL_EXCEPT",), f"with {bit} in it")
     exceptions = values.get("COM_RCL_EXCEPT", bit)
     if not int(exceptions) & bit:
         effect = (

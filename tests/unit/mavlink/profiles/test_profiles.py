@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.vehicle import Output
+from mavbridge.core.vehicle import ActionKind, Output
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import NoteKind, ParamContext, ParamNote, Profile
 from mavbridge.mavlink.profiles.px4 import PX4, event_id
@@ -55,6 +55,40 @@ def test_other_vehicles_and_firmware_are_refused(
 ) -> None:
     with pytest.raises(PeerError, match=told):
         require_profile(autopilot, vehicle_type)
+
+
+@BOTH
+@pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
+def test_the_wanted_value_of_a_parameter_is_told_once_whatever_it_is(
+    profile: Profile, kind: ActionKind
+) -> None:
+    output = profile.usual_output(kind)
+    wanted = [note.names for note in notes_of(profile, {}, output, kind="wanted")]
+    assert len(set(wanted)) == len(wanted) > 1
+    read = dict.fromkeys(profile.params, 1.0)
+    told = notes_of(profile, read, output, kind="wanted")
+    assert {len(note.names) for note in told} == {1}
+    assert {note.names[0] for note in told} <= {*profile.params, "SIMPLE", "SUPER_SIMPLE"}
+    assert not notes_of(profile, read, None, kind="wanted"), "nothing is sent yet"
+
+
+def test_the_wanted_values_follow_receiver_output_and_switch() -> None:
+    def wanted(output: Output, *, has_receiver: bool) -> dict[str, str]:
+        values = {"SYSID_MYGCS": 1.0, "RC7_OPTION": 46.0}
+        notes = notes_of(ARDUPILOT, values, output, kind="wanted", has_receiver=has_receiver)
+        return {note.names[0]: note.said for note in notes}
+
+    alone = wanted("rc-override", has_receiver=False)
+    assert alone["SYSID_MYGCS"] == "255, our system id"
+    assert alone["RC7_OPTION"] == "46, with its switch on"
+    assert (alone["FS_THR_ENABLE"], alone["FS_OPTIONS"]) == (
+        "not 0, without a receiver",
+        "24 (bit 3 set)",
+    )
+    assert wanted("rc-override", has_receiver=True)["FS_OPTIONS"] == "any"
+    assert wanted("rates", has_receiver=False)["FS_THR_ENABLE"] == "0"
+    assert wanted("rates", has_receiver=True)["ATC_ANGLE_BOOST"] == "any"
+    assert "GUID_OPTIONS" not in wanted("velocity", has_receiver=True)
 
 
 @BOTH
