@@ -51,14 +51,15 @@ class Recorder(ObserverThread):
         """Create the files, start the writer process and the thread, which takes seconds.
 
         ``packets_dropped`` and ``autopilot`` are asked at the end; ``report`` shows a line to the
-        user, from the recorder's thread. Without ``settings`` the flight cannot be replayed.
+        user, from the recorder's thread. Without ``settings`` nothing for a replay is kept.
 
         Raises:
             OSError, WriterError: a file cannot be written, or the writer process does not start.
         """
         self._folder = folder
+        is_replayed = settings is not None
         writer = FlightWriter(
-            folder, meta, pressure="online", with_replay=True, tlog_pipe=tlog_pipe
+            folder, meta, pressure="online", with_replay=is_replayed, tlog_pipe=tlog_pipe
         )
         if settings is not None:
             try:

@@ -36,8 +36,7 @@ _MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 class EpisodeControl:
     """Decides when an episode is wanted. Call ``step`` about twenty times a second."""
 
-    def __init__(self, *, has_switch: bool, on_arm: bool) -> None:
-        self._has_switch = has_switch
+    def __init__(self, *, on_arm: bool) -> None:
         self._on_arm = on_arm
         self._switch = Switch(rests=("low", "middle"))
         self._position: Position | None = None
@@ -55,10 +54,10 @@ class EpisodeControl:
     def step(self, now_ns: int, *, armed: bool, switch_us: int = 0, keys: str = "") -> Mark | None:
         """Advance to this time; return a mark for the current episode, or else for the last one.
 
-        ``switch_us`` is the pulse width of the switch's channel, 0 without a reading; ``keys`` were
+        ``switch_us`` is the pulse width of the switch's channel, 0 without one; ``keys`` were
         typed since the last step, in order.
         """
-        mark = self._by_switch(now_ns, switch_us) if self._has_switch else None
+        mark = self._by_switch(now_ns, switch_us)
         if self._on_arm:
             self._by_arming(now_ns, armed)
         for key in keys:

@@ -91,9 +91,7 @@ class _Session:
         self._clock = clock
         self._stack = stack
         self._keys: deque[str] = deque(maxlen=MAX_KEYS)
-        self._control = EpisodeControl(
-            has_switch=config.episode_channel is not None, on_arm=config.on_arm
-        )
+        self._control = EpisodeControl(on_arm=config.on_arm)
         self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
@@ -176,13 +174,11 @@ class _Session:
         """Update the episodes and the status line; return False when the session is over."""
         self._look_at_disk()
         keys = "".join(self._keys.popleft() for _ in range(len(self._keys)))
-        status, channel = self._view.status, self._config.episode_channel
-        has_channel = channel is not None and len(status.rc_channels_us) >= channel
+        status = self._view.status
+        channels_us = dict(enumerate(status.rc_channels_us, start=1))
+        switch_us = channels_us.get(self._config.episode_channel or 0, 0)
         mark = self._control.step(
-            self._clock.now_ns(),
-            armed=status.armed,
-            switch_us=status.rc_channels_us[channel - 1] if channel and has_channel else 0,
-            keys=keys,
+            self._clock.now_ns(), armed=status.armed, switch_us=switch_us, keys=keys
         )
         if mark is not None:
             self._episodes.mark(mark)

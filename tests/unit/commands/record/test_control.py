@@ -11,7 +11,8 @@ class Session:
     """Records what is wanted, as a recording session does."""
 
     def __init__(self, *, has_switch: bool = False, on_arm: bool = False) -> None:
-        self.control = EpisodeControl(has_switch=has_switch, on_arm=on_arm)
+        self.control = EpisodeControl(on_arm=on_arm)
+        self.has_switch = has_switch
         self.now_ns = 0
         self.is_recording = False
         self.may_begin = True
@@ -23,7 +24,8 @@ class Session:
         done: list[str] = []
         for _ in range(times):
             self.now_ns += STEP_NS
-            mark = self.control.step(self.now_ns, armed=armed, switch_us=switch_us, keys=keys)
+            read_us = switch_us if self.has_switch else 0
+            mark = self.control.step(self.now_ns, armed=armed, switch_us=read_us, keys=keys)
             keys, wanted = "", self.control.wanted is not None
             if mark is not None:
                 done.append(mark)

@@ -70,6 +70,7 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
         assert (flight.meta.ticks_dropped, flight.meta.frames_dropped) == (0, 0)
         assert flight.meta.success is None
         assert (flight.folder / "link.tlog").read_bytes()[8:] == PACKET
+        assert not (flight.folder / "solves.parquet").exists(), "there is nothing to replay"
     assert [row.tick.index for row in stand.flight(2).tick_rows()] == [40, 41, 42]
     assert stand.episodes.counts.total() == 2
 
