@@ -331,14 +331,6 @@ class ActionTrace(NamedTuple):
     smoothed: Action
 
 
-class Packet(NamedTuple):
-    """One received or sent MAVLink packet."""
-
-    stamp_ns: int
-    """Arrival, or time at which it was handed to the kernel."""
-    data: bytes
-
-
 class ForwardedPacket(NamedTuple):
     """One packet of the vehicle, with what a later reader needs to compute its age."""
 

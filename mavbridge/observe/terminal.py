@@ -50,10 +50,6 @@ class RateMeter:
         """Count an event. Count and stamp change in one step because another thread reads them."""
         self._newest = (self._newest[0] + 1, stamp_ns)
 
-    def set(self, count: int, stamp_ns: int) -> None:
-        """Set an externally kept count, with the stamp of the newest event."""
-        self._newest = (count, stamp_ns)
-
     def sample_hz(self) -> float | None:
         """Return events per second, or None while no events come. Call once per refresh."""
         if self._newest[0] == 0:

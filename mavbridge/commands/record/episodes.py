@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
-from mavbridge.core.vehicle import ForwardedPacket, Packet
+from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.observers import flight_meta
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.codec.tlog import PacketPipe
@@ -189,7 +189,7 @@ class Episodes:
         with self._log_lock:
             if (episode := self.current) is not None:
                 for packet in packets:
-                    episode.log.put(Packet(packet.arrived_ns, packet.data))
+                    episode.log.put(packet.arrived_ns, packet.data)
 
     @property
     def number(self) -> int:

@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.frames import MARKER, RawPacket, frame_at
 
 _STAMP_BYTES = 8
@@ -36,10 +35,11 @@ class PacketPipe:
         self.dropped = 0
         """Number of packets missing from the log because the pipe was full or its reader gone."""
 
-    def put(self, packet: Packet, /) -> None:
-        """Write the packet, or drop and count it; neither block nor raise."""
-        stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_LINK_MASK
-        record = stamp_us.to_bytes(_STAMP_BYTES, "big") + packet.data
+    def put(self, stamp_ns: int, packet: bytes) -> None:
+        """Write a packet that arrived, or was handed to the kernel, at this time, or drop and count
+        it; neither block nor raise."""
+        stamp_us = (stamp_ns + self._offset_ns) // 1000 & ~_LINK_MASK
+        record = stamp_us.to_bytes(_STAMP_BYTES, "big") + packet
         try:
             if self._fd is not None and len(record) <= select.PIPE_BUF:
                 os.write(self._fd, record)

@@ -7,7 +7,7 @@ from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import AdviceText, Outlet, Packet
+from mavbridge.core.vehicle import AdviceText, Outlet
 from mavbridge.mavlink.codec.messages import Endpoint, ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.readers import UNKNOWN
@@ -200,7 +200,7 @@ class Connection:
                     self.received_packets += message.name != UNKNOWN
                     self.radio_packets += message.name == "RADIO_STATUS"
                     if self._log is not None:
-                        self._log.put(Packet(arrived_ns, message.packet))
+                        self._log.put(arrived_ns, message.packet)
                     yield message, arrived_ns, sender
                 self._notice_signatures()
                 if self._clock.now_ns() - now_ns > DRAIN_BUDGET_NS:
@@ -250,7 +250,7 @@ class Connection:
             return False
         self._refused_ns = None if is_sent else self._refused_ns or self._clock.now_ns()
         if is_sent and self._log is not None:
-            self._log.put(Packet(self._clock.now_ns(), data))
+            self._log.put(self._clock.now_ns(), data)
         return is_sent
 
     def close(self) -> None:

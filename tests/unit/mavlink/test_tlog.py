@@ -10,7 +10,6 @@ from pymavlink import mavutil
 
 from helpers.wire import WireEnd
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe, read_tlog
 
 
@@ -34,9 +33,9 @@ def stand() -> Iterator[Stand]:
 
 
 def test_a_record_is_the_time_of_the_packet_and_the_packet(stand: Stand) -> None:
-    stand.log.put(Packet(0, bytes(1 << 14)))  # what could be torn is dropped
-    stand.log.put(Packet(11_000, b"first"))
-    stand.log.put(Packet(23_000, b"second"))
+    stand.log.put(0, bytes(1 << 14))  # what could be torn is dropped
+    stand.log.put(11_000, b"first")
+    stand.log.put(23_000, b"second")
     stand.log.close()
     assert stand.read() == bytes(7) + b"\x0cfirst" + bytes(7) + b"\x18second"
     assert stand.read() == b"", "the end"
@@ -46,12 +45,12 @@ def test_a_record_is_the_time_of_the_packet_and_the_packet(stand: Stand) -> None
 def test_a_full_pipe_drops_whole_records_and_counts_them(stand: Stand) -> None:
     offered = 0
     while stand.log.dropped < 3:
-        stand.log.put(Packet(0, offered.to_bytes(4, "big") + bytes(276)))
+        stand.log.put(0, offered.to_bytes(4, "big") + bytes(276))
         offered += 1
     data, size = stand.read(), 8 + 280
     numbers = [int.from_bytes(data[at + 8 : at + 12], "big") for at in range(0, len(data), size)]
     assert numbers == [*range(offered - 3)]
-    stand.log.put(Packet(0, b"there is room again"))
+    stand.log.put(0, b"there is room again")
     assert stand.read().endswith(b"there is room again")
     assert stand.log.dropped == 3
 
@@ -61,10 +60,10 @@ def test_after_the_reader_is_gone_everything_is_counted_and_nothing_is_raised() 
     log = PacketPipe(writer, wall_offset_ns=0)
     os.close(reader)
     for _ in range(5):
-        log.put(Packet(0, b"packet"))
+        log.put(0, b"packet")
     log.close()
     log.close()
-    log.put(Packet(0, b"late"))
+    log.put(0, b"late")
     assert log.dropped == 6
 
 
@@ -76,8 +75,8 @@ def test_pymavlink_reads_the_log(tmp_path: Path) -> None:
     for k in range(5):
         stamp_ns = 5_000_000_000 + k * 10_000_000
         sent = end.pack(end.mav.manual_control_encode(1, k, 0, 0, 0, 0))
-        log.put(Packet(stamp_ns, end.heartbeat()))
-        log.put(Packet(stamp_ns + 2_000_000, sent))
+        log.put(stamp_ns, end.heartbeat())
+        log.put(stamp_ns + 2_000_000, sent)
     log.close()
     reader = mavutil.mavlogfile(str(path))
     read = []

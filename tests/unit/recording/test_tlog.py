@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from helpers.recordings import count_frames, make_row, picture
-from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogPipe, TlogThread, open_tlog_pipe
 from mavbridge.recording.video_process import VideoJob
@@ -51,7 +50,7 @@ def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWri
 
 def send(link: PacketPipe, count: int) -> None:
     for k in range(count):
-        link.put(Packet(k * 1000, b"%05d" % k))
+        link.put(k * 1000, b"%05d" % k)
 
 
 @pytest.mark.parametrize(
