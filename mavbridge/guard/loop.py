@@ -99,8 +99,8 @@ class GuardLoop:
         """Error of the last pass while a command was encoded or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
-        self._words: tuple[tuple[int, bytes], ...] = ()
-        """Last words: delays [ns] and packets that make the vehicle safe if this process dies."""
+        self._words = LastWords(self._phase, None, None, brings_file=False, packets=())
+        """Newest last words: packets that make the vehicle safe if this process dies."""
         self._words_basis: object = None
         self._words_due_ns = 0
         self._words_outlet: Outlet | None = None
@@ -118,14 +118,21 @@ class GuardLoop:
         self._stop = self._stop or ending
 
     def abandon(self) -> None:
-        """Send the last words without the state machine, after a bug in the guard."""
+        """Send the last words without the state machine, after a bug in the guard.
+
+        After each packet the flight process gets the rest: it kills a silent guard that holds the
+        vehicle, and sends what it has.
+        """
         with suppress(Exception):
             self._prepare_words(self._link.outlet)
-        died_ns = self._clock.now_ns()
-        for after_ns, packet in self._words:
+        died_ns, packets = self._clock.now_ns(), self._words.packets
+        for sent, (after_ns, packet) in enumerate(packets, 1):
             self._clock.sleep_until_ns(died_ns + after_ns)
             with suppress(Exception):
                 self._link.transmit(packet)
+            left = tuple((at_ns - after_ns, later) for at_ns, later in packets[sent:])
+            with suppress(Exception):
+                self._flight.send(encode_from_guard(self._words._replace(packets=left)))
 
     def _renew_words(self, snapshot: LinkSnapshot, tick: GuardTick) -> None:
         """Prepare the last words when their inputs have changed, and periodically."""
@@ -147,14 +154,15 @@ class GuardLoop:
             return
         is_held = self.guard.engagement.phase in _TAKEN and outlet.fd is not None
         plan = tuple(self.guard.rehearse()) if is_held else ()
-        before, self._words = self._words, self._link.rehearse(plan)
-        if not (before or self._words):
+        packets = self._link.rehearse(plan)
+        if not (self._words.packets or packets):
             return
         mode = next((mode for _, _, mode in plan if mode is not None), None)
-        is_new = bool(self._words) and outlet != self._words_outlet
-        words = LastWords(self.guard.engagement.phase, mode, outlet.receiver, is_new, self._words)
+        is_new = bool(packets) and outlet != self._words_outlet
+        words = LastWords(self.guard.engagement.phase, mode, outlet.receiver, is_new, packets)
+        self._words = words._replace(brings_file=False)
         is_told = self._flight.send(encode_from_guard(words), outlet.fd if is_new else None)
-        self._words_outlet = outlet if is_told and self._words else None
+        self._words_outlet = outlet if is_told and packets else None
 
     def run(self, woken_by: SocketPort) -> None:
         """Step at every arrival and at every deadline until control has been given back.

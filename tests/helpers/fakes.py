@@ -84,6 +84,7 @@ class FakeLink:
         self._samples: tuple[Sample, ...] = ()
         self._telemetry = Telemetry()
         self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
+        self.modes = COPTER_MODES
         self.texts: list[str] = []
         self.is_engaged = False
         self.is_restored = True
@@ -126,7 +127,7 @@ class FakeLink:
             problem=None,
             echo_confirmed=True,
             is_released=not holds,
-            modes=COPTER_MODES,
+            modes=self.modes,
             texts=texts,
         )
 

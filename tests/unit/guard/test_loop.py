@@ -434,9 +434,21 @@ def test_a_guard_that_fails_says_its_last_words_itself() -> None:
     rig = Rig(pilot_sticks=IDLE).flying()
     expected = said(rig)
     died_ns = rig.clock.now_ns()
+    rig.port.received.clear()
     rig.loop.abandon()
     transmitted = [((at_ns - died_ns) // MS, text) for at_ns, text in rig.link.transmitted]
     assert transmitted == expected
+    # At each packet the flight process hears what is left, so that nothing is said twice.
+    whole, *rests = (
+        [(after_ns // MS, packet.decode()) for after_ns, packet in told.packets]
+        for told in rig.got(LastWords)
+    )
+    assert whole == expected
+    for sent, rest in enumerate(rests, 1):
+        since_ms = expected[sent - 1][0]
+        assert rest == [(after_ms - since_ms, text) for after_ms, text in expected[sent:]]
+    assert rests[-1] == []
+    assert rig.port.files == [7]
 
     def explode() -> None:
         raise OSError("no link")
