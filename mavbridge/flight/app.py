@@ -363,7 +363,7 @@ class _Flight:
             left = f"still armed in {view.status.mode or 'an unknown mode'}{height}"
             if summary is not None:
                 screen.show_message(f"control given back, {left}")
-            elif view.phase is Phase.HOLDING and not self._guard.wait(0):
+            elif view.phase is Phase.HOLDING and not (self._guard.is_stuck or self._guard.wait(0)):
                 holder = f"the guard (process {self._guard.pid})"
                 screen.show_message(f"{left}: {holder} keeps sending neutral sticks")
         if summary is not None:

@@ -85,6 +85,8 @@ class GuardProcess:
         """Telemetry log of a flight that is recorded."""
         self.error: MavbridgeError | None = None
         """Error that ended the guard."""
+        self.is_stuck = False
+        """True if the guard stands still and was not killed."""
         self.send(settings)
 
     @property
@@ -117,16 +119,20 @@ class GuardProcess:
         """Pass the guard's messages to ``view`` until it ends or ``stop`` is set.
 
         A guard that stands still while it holds the vehicle is killed, since nothing may be sent in
-        its place while it lives.
+        its place while it lives. Where that would come too late, it is left to end the flight by
+        itself, should it go on.
 
         Raises:
-            GuardDiedError: the guard has exited without its summary.
+            GuardDiedError: the guard has exited without its summary, or stands still.
             PeerError, UserError: the error that the guard reported.
         """
         early, self._early = self._early, []
         for message in early:
             self._take(message, view)
         if stands_still := self._stands_still(stop, view):
+            if (late := self._too_late()) is not None:
+                self.is_stuck = True
+                raise GuardDiedError(f"the guard (process {self.pid}) stands still: {late}")
             self._process.kill()
         if self.error is not None:
             raise self.error
@@ -159,12 +165,19 @@ class GuardProcess:
         return False
 
     def _holds_vehicle(self) -> bool:
-        """True if the last words could be sent now, were the guard dead."""
+        """True if the last words, but for their age, could be sent, were the guard dead."""
         newest, words = self._newest, self._words
         if newest is None or words is None or not words.packets:
             return False
-        silent_ns = self._clock.now_ns() - newest.sent_ns
-        return newest.phase in (words.phase, *_STILL_OURS) and silent_ns <= LATEST_NS
+        return newest.phase in (words.phase, *_STILL_OURS)
+
+    def _too_late(self) -> str | None:
+        """Return what to tell the user if the last words are too old to be sent, or None."""
+        silent_ns = 0 if self._newest is None else self._clock.now_ns() - self._newest.sent_ns
+        if silent_ns <= LATEST_NS:
+            return None
+        silent_s = silent_ns / NS_PER_S
+        return f"silent for {silent_s:.1f} s, too long to send its last words; {OWN_TIMEOUT}"
 
     def _take(self, message: FromGuard, view: TelemetryCache) -> None:
         match message:
@@ -202,10 +215,8 @@ class GuardProcess:
             return "it had released the sticks"
         if not self.wait(REAP_S):
             return f"it does not exit, so nothing was sent in its place; {OWN_TIMEOUT}"
-        silent_ns = self._clock.now_ns() - newest.sent_ns
-        if silent_ns > LATEST_NS:
-            silent_s = silent_ns / NS_PER_S
-            return f"silent for {silent_s:.1f} s, too long to send its last words; {OWN_TIMEOUT}"
+        if (late := self._too_late()) is not None:
+            return late
         sent = 0
         for after_ns, packet in words.packets:
             self._clock.sleep_until_ns(died_ns + after_ns)
@@ -241,7 +252,7 @@ class GuardProcess:
         """Close the channel. A running guard takes this for our death, and ends by itself."""
         self._port.close()
         self.samples.close()
-        self.wait(CLOSE_S)
+        self.wait(0.0 if self.is_stuck else CLOSE_S)
         self._close_outlet()
 
 

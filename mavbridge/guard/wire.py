@@ -86,7 +86,7 @@ class LastWords(NamedTuple):
 
 
 class GuardDiedError(MavbridgeError):
-    """The guard process exited without its summary."""
+    """The guard process exited without its summary, or stands still."""
 
     exit_code = ExitCode.FAULT
 

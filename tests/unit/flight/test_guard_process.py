@@ -207,7 +207,7 @@ def test_a_fork_of_the_policy_does_not_hide_the_death_of_the_flight_process(rig:
 def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
     rig: Rig, case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link, stop, waits = udp(), threading.Event(), 0
+    link, stop, waits, waited_s = udp(), threading.Event(), 0, list[float]()
     phase = {"prepares": Phase.PREPARING, "released": Phase.RELEASED}.get(case, Phase.FLYING)
     if case != "knows no words":
         told = Phase.FLYING if case == "released" else phase
@@ -232,7 +232,17 @@ def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
 
     real_select, rig.child.kill = select.select, kill
     monkeypatch.setattr(select, "select", wait_in_vain)
-    if case not in ("holds", "prepares"):
+    if case == "too late":  # the user is told at once, and a guard that goes on ends the flight
+        with pytest.raises(
+            GuardDiedError, match=r"4321\) stands still: silent for 0\.5 s, too long"
+        ):
+            rig.guard.listen(stop, View())
+        assert rig.child.returncode is None
+        assert link.heard() == []
+        rig.child.wait = lambda timeout_s: waited_s.append(timeout_s) or 0
+        rig.guard.close()
+        assert waited_s == [0.0]
+    elif case not in ("holds", "prepares"):
         rig.guard.listen(stop, View())
         assert link.heard() == []
     else:
