@@ -141,9 +141,9 @@ class Pilot:
         self._guide = CourseGuide(self._flight.course, agility, self._speed_mps, next_gate)
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        self._solves += 1
         horizon = self.runner.contract.horizon
         if self._guide is None:  # not engaged yet: the guard has to see chunks first
+            self._solves += 1
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_ns, body = self._flight.clock.now_ns(), self._flight.vehicle.ap.truth
         now_s, solve_ns = now_ns / NS_PER_S, self._variation.delays.vision.offset_ns
@@ -155,16 +155,17 @@ class Pilot:
         else:
             sticks = expert_sticks(self._guide, body, now_s)
             label, disturbed = Sticks(*sticks), self._disturbance.flown(sticks, now_s)
-        self.expert_actions[self._solves] = label
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
-        if self._student is None:
-            return chunk
-        # Also in the expert's turns: the student can have internal state.
-        if self._planned is None or now_ns - self._planned[0] >= solve_ns:
-            self._planned = now_ns, self._student.act(encoded, state, history).copy()
-        planned_ns, plan = self._planned
-        passed = (now_ns - planned_ns) / NS_PER_S / self._student.contract.chunk_dt_s
-        return from_now(plan, passed) if self._turns.is_students(now_s) else chunk
+        if self._student is not None:
+            # Also in the expert's turns: the student can have internal state.
+            if self._planned is None or now_ns - self._planned[0] >= solve_ns:
+                self._planned = now_ns, self._student.act(encoded, state, history).copy()
+            planned_ns, plan = self._planned
+            passed = (now_ns - planned_ns) / NS_PER_S / self._student.contract.chunk_dt_s
+            chunk = from_now(plan, passed) if self._turns.is_students(now_s) else chunk
+        self._solves += 1  # a chunk that the student refuses gets no serial
+        self.expert_actions[self._solves] = label
+        return chunk
 
 
 def from_now(plan: FloatArray, passed: float) -> FloatArray:

@@ -17,7 +17,7 @@ from mavbridge.config.episodes import COURSE_SEEDS, AutopilotKind, DemonstrateCo
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import BodyRates
+from mavbridge.core.vehicle import BodyRates, Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.folder import write_meta
 from mavbridge.recording.video_writer import WriterDiedError
@@ -220,6 +220,37 @@ def test_a_student_without_a_checkpoint_flies(tmp_path: Path) -> None:
     meta = open_flight(tmp_path / "a/000000").meta
     assert (meta.source, meta.policy, meta.mode, meta.action_hz) == ("dagger", spec, "single", 30)
     assert list(meta.policy_files) == [f"{tmp_path}/mine.py"]
+
+
+REFUSING = f"""
+from policy.errors import NoChunkError
+calls = 0
+{STUDENT.replace("return", "refuse_some(); return")}
+def refuse_some():
+    global calls
+    calls += 1
+    if calls % 7 in (2, 4):
+        raise NoChunkError("not now")
+"""
+
+
+def test_labels_are_of_the_rows_own_solves_if_the_student_refuses_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine.py").write_text(REFUSING)
+    monkeypatch.setattr(
+        "mavbridge.commands.demonstrate_pilot.expert_sticks",
+        lambda _guide, _body, now_s: Sticks(0.0, 0.0, 0.0, now_s / 1e4),  # when it was asked
+    )
+    policy = PolicyConfig(policy=f"{tmp_path}/mine.py:Single", seed=3)
+    asked = replace(config(tmp_path, max_time=1.5), policy=policy)
+    fly_demonstration(
+        DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=asked), lambda: False
+    )
+    flight = open_flight(tmp_path / "000000")
+    solved_ns = column(flight, "chunk_computed_ns") - column(flight, "predict_ns")
+    assert len(solved_ns) > 10
+    np.testing.assert_allclose(1e4 * column(flight, "expert")[:, 3], solved_ns / 1e9, atol=1e-3)
 
 
 def test_a_scripted_student_lives_in_simulated_time(tmp_path: Path) -> None:
