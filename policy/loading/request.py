@@ -34,9 +34,9 @@ def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTime
     begun_s = now_s()
     while len(act_s) < REPETITIONS and (not act_s or 0 < now_s() - begun_s < MOST_S):
         before_s = now_s()
-        encoded = encode_all(runner, images)
-        encoded_s = now_s()
         try:
+            encoded = encode_all(runner, images)
+            encoded_s = now_s()
             runner.act(encoded, state, history)
         except NoChunkError:
             return None

@@ -66,6 +66,28 @@ def test_a_policy_without_a_chunk_for_the_first_states_is_loaded(folder, arrays)
     assert (loaded.runner.engine, loaded.times) == (arrays, None)
 
 
+SKIPPING = """
+from numpy import zeros
+from policy.contract import Contract
+from policy.errors import NoChunkError
+class Skipping:
+    contract = Contract(arrays="numpy", feature_dim=8, image_height=32, image_width=32)
+    def encode_visual(self, image):
+        raise NoChunkError("no contrast in this image")
+    def predict_fast(self, feature, state, history, steps):
+        return zeros((1, 16, 4), "f4")
+    def predict(self, image, state, history, steps):
+        return self.predict_fast(self.encode_visual(image), state, history, steps)
+"""
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_a_policy_that_skips_the_dummy_image_is_loaded(folder: Path, dual_rate: bool) -> None:
+    (folder / "skipping.py").write_text(SKIPPING)
+    loaded = load("./skipping.py:Skipping", dual_rate=dual_rate)
+    assert (loaded.runner.dual_rate, loaded.times) == (dual_rate, None)
+
+
 def test_files_of_one_name_are_two_policies(folder: Path) -> None:
     for name, value in (("first", 0.1), ("second", 0.2)):
         (folder / name).mkdir()
