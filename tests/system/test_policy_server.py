@@ -382,6 +382,29 @@ def test_a_served_policy_is_told_that_a_flight_begins() -> None:
             assert policy.resets == 1
 
 
+def test_no_chunk_is_flown_before_a_reset_has_succeeded() -> None:
+    policy, failures = Echo(), ["device busy", "device busy"]
+
+    def reset() -> None:
+        if failures:
+            raise PolicyError(failures.pop())
+        policy.reset()
+
+    runner = make_numpy_runner(policy, ExecutionSettings(name="echo", dual_rate=False))
+    with our_server(replace(runner, reset=reset)) as port:
+        remote, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
+        with closing(remote):
+            inputs = sample(runner, 0)
+            remote.reset()
+            remote._timeout_s = PATIENT_S  # type: ignore[attr-defined]
+            for _ in range(2):
+                with pytest.raises(NoChunkError, match="device busy"):
+                    remote.predict(*inputs, 10)
+            for _ in range(2):
+                remote.predict(*inputs, 10)
+            assert (policy.resets, failures) == (1, [])
+
+
 def served_echo() -> PolicyRunner:
     return make_numpy_runner(Echo(), ExecutionSettings(name="echo", dual_rate=False))
 

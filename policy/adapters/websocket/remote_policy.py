@@ -268,9 +268,9 @@ class RemotePolicy:
         if self._is_ours and self._has_begun:
             message[RESET_KEY] = True
         data = self._link.ask(pack(message), self._timeout_s)
-        self._has_begun = False
         if isinstance(data, str):
             raise NoChunkError(f"the policy server failed: {last_line(data)}")
+        self._has_begun = False  # not before: it may be the reset that failed
         try:
             return self._chunk(unpack(data))
         except MessageError as error:
