@@ -182,7 +182,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
         loop = StickLoop(rates_contract(contract))
         gains = loop.thrust_gains(vectors(name, ticks, "sent", ACTION_DIM)[:, 0], state)
         target[is_target] = loop.to_sticks(target[is_target], state[is_target], gains[is_target])
-    state[~is_target] = np.nan
+    state[~(is_target | is_target[flew])] = np.nan
     return FlightData(
         name=name,
         tick_ns=tick_ns,

@@ -2,7 +2,7 @@
 
 import json
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,7 @@ def fly(
     period_ms: float = 33.0,
     expert: bool = True,
     released: range = range(0),
+    refused: Container[int] = (),
     video_frames: int | None = None,
     size: int = SIZE,
     number: int = 0,
@@ -58,7 +59,8 @@ def fly(
     woke = list(range(START, captured[-1] + 50 * MS, 10 * MS))
     count = len(woke)
     state = [(0.01 * k, number, *LEVEL[2:]) for k in range(count)]
-    sent = [None if k in released else (-0.001 * k, 0.0, 0.0, 0.5) for k in range(count)]
+    sticks = [(-0.001 * k, 0.0, 0.0, 0.5) for k in range(count)]
+    sent = [None if k in released or k in refused else sticks[k] for k in range(count)]
     labels = [(0.001 * k, 0.1, 0.2, 0.3) for k in range(count)] if expert else None
     shown = frames if video_frames is None else video_frames
     return write_flight(
@@ -70,6 +72,7 @@ def fly(
             state=state,
             attitude_lag_ns=2 * MS,
             sent_lag_ns=1 * MS,
+            phase=["released" if k in released else "flying" for k in range(count)],
         ),
         captured_ns=captured,
         images=[spot(size, 2 * k / frames - 1) for k in range(shown)],
@@ -159,6 +162,13 @@ def test_a_pause_makes_two_episodes(tmp_path: Path) -> None:
     skipped = len(images) - len(second.captured_ns)
     error = np.abs(next(iter(second.decode())).astype(int) - images[skipped].astype(int))
     assert error.mean() < 3.0
+
+
+def test_actions_that_the_link_refused_cut_no_episode(tmp_path: Path) -> None:
+    refused = np.flatnonzero(np.random.default_rng(0).random(110) < 0.4).tolist()
+    (whole,) = stretches(read_flight(fly(tmp_path / "a", expert=False)))
+    (part,) = stretches(read_flight(fly(tmp_path / "b", expert=False, refused=refused)))
+    np.testing.assert_array_equal(part.columns[STATE_KEY], whole.columns[STATE_KEY])
 
 
 def test_a_video_that_breaks_off_ends_its_episode(tmp_path: Path) -> None:

@@ -116,6 +116,7 @@ def test_only_what_the_policy_flew_is_imitated_not_the_guards_neutral_sticks(
     episode = read_flight(folder)
     assert episode.target_ns.tolist() == WOKE[1:2]
     np.testing.assert_allclose(episode.sent, [neutral, STICK, STICK, neutral, neutral])
+    assert np.isfinite(episode.state).all(axis=1).tolist() == [False, True, True, False, False]
 
 
 def test_a_pilots_sticks_are_imitated_in_modes_of_the_contract(tmp_path: Path) -> None:
