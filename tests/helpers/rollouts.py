@@ -148,10 +148,17 @@ def segments(sampler: Sampler, plan: RolloutPlan, decider: str) -> Iterator[Segm
 
 
 def write_flight(
-    folder: Path, *, ticks: bool = True, frames: bool = True, meta: FlightMeta | None = None
+    folder: Path,
+    *,
+    ticks: bool = True,
+    frames: bool = True,
+    meta: FlightMeta | None = None,
+    refused: range = range(0),
 ) -> Path:
     """Write a second of a flight: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
     events = [*map(_tick, range(100 * ticks)), *map(_frame, range(30 * frames))]
+    for index in refused:
+        events[index] = replace(events[index], sent=None)
     return write_recording(folder, events, meta=meta)
 
 

@@ -173,12 +173,12 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
                 f"state is {age_ns / NS_PER_MS:.0f} ms old (limit {MAX_STATE_AGE_NS // NS_PER_MS} "
                 "ms): choose another --start-at, or the flight of a faster policy"
             )
-    sent = [(row.tick.sent_ns, row.tick.sent) for row in flight.tick_rows()]
+    rows = [row.tick for row in flight.tick_rows() if not row.tick.is_refused]
     return RolloutStart(
         images=_start_images(flight, frames, config.image_size),
         states=np.array(ticks["state"].take(known).to_pylist(), np.float32),
         newest_ns=newest_ns,
-        sent=tuple((at_ns, action) for at_ns, action in sent if at_ns < newest_ns),
+        sent=tuple((tick.sent_ns, tick.sent) for tick in rows if tick.sent_ns < newest_ns),
     )
 
 

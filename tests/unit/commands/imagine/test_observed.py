@@ -51,6 +51,15 @@ def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight:
     assert sticks.yaw == pytest.approx(0.049)
 
 
+def test_the_vehicle_flew_on_by_the_action_before_one_that_the_link_refused(tmp_path: Path) -> None:
+    folder = write_flight(tmp_path / "a", refused=range(1, 100, 2))
+    seen = ObservationQueue(
+        read_start(open_flight(folder), TINY, 0.4), make_sampler(), RecordingDecider()
+    )
+    # Before 0.5 s, every 0.05 s: an even tick, or the one before an odd one.
+    np.testing.assert_allclose(seen.history()[0, :, 1], [0.03, 0.034, 0.04, 0.044], atol=1e-6)
+
+
 def test_a_flight_without_states_frames_or_known_axes_is_refused(tmp_path: Path) -> None:
     blind = open_flight(write_flight(tmp_path / "a", frames=False))
     axes = replace(blind, meta=replace(blind.meta, contract=Contract(state_frame="enu_flu")))
