@@ -165,7 +165,8 @@ def first_with_chunks(
             runner = make()
             reason = parity_failure(expected, chunks_of_samples(runner, samples))
         except (PolicyError, RuntimeError, TypeError) as error:
-            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
+            told = [*str(error).strip().splitlines(), "(nothing)"][0]
+            reason = f"{type(error).__name__}: {told}"
         if reason is None:
             return runner, tuple(notes)
         notes.append(warned(f"engine {label} is passed over: {reason}"))

@@ -160,15 +160,22 @@ def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason
     assert re.search(reason, notes[0])
 
 
-def test_an_engine_that_fails_is_passed_over(small_toge: Toge) -> None:
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (RuntimeError("no memory\nat x.cpp:3"), "RuntimeError: no memory"),
+        (TypeError(), "TypeError: (nothing)"),
+    ],
+)
+def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception, told: str) -> None:
     def broken() -> PolicyRunner:
-        raise RuntimeError("no memory\nat x.cpp:3")
+        raise error
 
     right = altered(small_toge, lambda chunk: chunk)
     runner, notes = first_that_agrees(small_toge, [("broken", broken), right], SETTINGS)
     assert runner.engine == "wrong"  # by name only
     assert "engine broken is passed over" in notes[0]
-    assert notes[0].endswith("no memory")
+    assert notes[0].endswith(told)
     assert "agrees with torch" in notes[1]
 
 
