@@ -222,15 +222,17 @@ class StickLoop:
         """Return the factor on thrusts at each of N decisions of a flight, float32 [N].
 
         Args:
-            sent: thrust sent at each decision [N], which the next one measures with; NaN: none.
+            sent: thrust sent at each decision [N], which the next one measures with; NaN: refused,
+                so that the vehicle flies on by the one before.
             state: state at each decision [N, state_dim]; NaN where none is known.
         """
-        gain, values = ThrustGain(self.contract.hover_thrust), []
-        before = (self.contract.hover_thrust, *np.nan_to_num(sent[:-1]).tolist())
-        for thrust, at in zip(before, state, strict=True):
+        flown = self.contract.hover_thrust
+        gain, values = ThrustGain(flown), []
+        for thrust, at in zip(sent.tolist(), state, strict=True):
             if np.isfinite(at).all():
-                gain.update(thrust, at)
+                gain.update(flown, at)
             values.append(gain.value)
+            flown = flown if math.isnan(thrust) else thrust
         return np.array(values, np.float32)
 
     def to_sticks(

@@ -179,6 +179,15 @@ def test_drag_through_the_rotors_is_not_taken_for_weight(weight: float) -> None:
     assert gain.value == pytest.approx(weight, rel=1e-3)
 
 
+def test_thrust_that_the_link_refused_is_not_taken_for_motors_off() -> None:
+    loop, at = StickLoop(CONTRACT), np.tile(state(), (200, 1))
+    at[:, VELOCITY] = 3.0
+    sent = np.repeat(np.linspace(0.4, 0.6, 100), 2)
+    kept = loop.thrust_gains(sent, at)
+    sent[1::2] = np.nan  # as refused; the ones before fly on
+    np.testing.assert_array_equal(loop.thrust_gains(sent, at), kept)
+
+
 def test_other_axes_are_refused() -> None:
     with pytest.raises(ContractError, match="not in enu_flu"):
         StickLoop(replace(CONTRACT, state_frame="enu_flu"))

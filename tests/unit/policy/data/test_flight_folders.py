@@ -215,7 +215,7 @@ def test_by_rates_the_thrust_of_a_heavy_vehicle_is_not_imitated(tmp_path: Path) 
         sent=[None, *[thrust] * (count - 1)],
     )
     climb = read_flight(folder).target[:, 0]
-    assert climb[0] > 0.09
+    assert climb[0] == pytest.approx(0.2 * 9.80665 / 4.0 / 6.0, rel=1e-3)
     assert abs(climb[-1]) < 0.01
 
 
