@@ -201,7 +201,9 @@ class PolicyDecider:
             # Image and state have the same age: no motion since the exposure.
             state = np.pad(state, ((0, 0), (0, SINCE_EXPOSURE_DIM)))
         feature = self._runner.encode(seen.images[-1])
-        chunk = self._runner.act(feature, state, seen.history())[0]
+        prefix = (0, 0), (0, self.contract.prefix_len), (0, 0)  # NaN: deciding takes no time here
+        history = np.pad(seen.history(), prefix, constant_values=np.nan)
+        chunk = self._runner.act(feature, state, history)[0]
         samples = np.arange(self._frames * SAMPLES_PER_STEP)
         samples_s = (samples + 0.5) / SAMPLES_PER_STEP * self._frame_dt_s
         rows_s = np.arange(len(chunk)) * self.contract.chunk_dt_s

@@ -108,6 +108,21 @@ def test_a_scripted_policy_lives_in_imagined_time() -> None:
     assert times == [0, 2 * step_ns, 4 * step_ns]
 
 
+def test_no_action_is_committed_where_deciding_takes_no_time() -> None:
+    contract, histories = Contract(feature_dim=1, arrays="numpy", prefix_len=3), []
+
+    def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        histories.append(history)
+        return np.zeros((1, 16, 4), np.float32)
+
+    sampler, runner = make_sampler(), replace(noise_runner(contract), act=act)
+    decider = PolicyDecider(runner, sampler, SteppedClock(START_NS))
+    list(rollout(sampler, decider, make_start(), make_plan()))
+    for history in histories:
+        assert (history.shape, history.dtype) == ((1, *contract.history_shape), np.float32)
+        assert np.isnan(history[0, :, 0]).tolist() == [False] * 4 + [True] * 3
+
+
 @pytest.mark.parametrize(
     ("term", "value"),
     [("state_frame", "enu_flu"), ("full_lean_deg", 45.0), ("modes", ("LOITER",))],
