@@ -161,11 +161,12 @@ class PushResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identification:
-    """All results, the missing ones with their reasons, and the hover thrust."""
+    """All results, and the missing ones with their reasons."""
 
     pushes: tuple[PushResult, ...]
     missing: tuple[str, ...]
-    hover_thrust: float | None
+    policy_hover_thrust: float | None
+    """Policy's thrust that hovers, before the guard scales it by the vehicle's hover parameter."""
 
 
 def identify_pushes(
@@ -190,7 +191,7 @@ def identify_pushes(
         still = [(input_s >= end_s - STILL_S) & (input_s < end_s) for end_s in ends_s]
         rested = thrust[np.any(still, axis=0)]
         hover = float(np.median(rested)) if len(rested) else None
-    return Identification(pushes=tuple(pushes), missing=tuple(missing), hover_thrust=hover)
+    return Identification(pushes=tuple(pushes), missing=tuple(missing), policy_hover_thrust=hover)
 
 
 def _fit_push(
@@ -305,7 +306,7 @@ def _fit_response(held: Array, moved: Array, settled: Mask, known: Array | None)
 
 
 def print_identification(found: Identification, contract: Contract, console: Console) -> None:
-    """Print every push, the hover thrust, and the missing results."""
+    """Print every push, the policy's hover thrust, and the missing results."""
     is_sticks = contract.action == "sticks"
     given, expected = ("stick", "trained with") if is_sticks else ("commanded", "expected")
     header = ["axis", given, "motion", "measured", expected, "ratio", "dead time", "63 %"]
@@ -323,9 +324,9 @@ def print_identification(found: Identification, contract: Contract, console: Con
         for push in found.pushes
     ]
     console.print(make_table("what the vehicle does", header, rows, left_columns=3))
-    if found.hover_thrust is not None:
-        told = f"hovers at a thrust of {found.hover_thrust:.3f}, trained with"
-        console.print(f"{told} {contract.hover_thrust:.3f}")
+    if (hover := found.policy_hover_thrust) is not None:
+        told = f"hovers at a policy's thrust of {hover:.3f}, which is scaled for the vehicle;"
+        console.print(f"{told} trained with {contract.hover_thrust:.3f}")
     for line in found.missing:
         console.print(f"not measured: {line}", style="yellow")
 
@@ -338,7 +339,7 @@ def as_document(
         "policy": config.flight.policy.policy,
         "action": contract.action,
         "trained_hover_thrust": contract.hover_thrust,
-        "hover_thrust": found.hover_thrust,
+        "policy_hover_thrust": found.policy_hover_thrust,
         "pushes": [asdict(push) | {"ratio": push.ratio} for push in found.pushes],
         "missing": found.missing,
     }
@@ -387,13 +388,12 @@ def doublet_policy(
     trained: Contract, clock: Clock, *, is_in_air: bool
 ) -> tuple[ScriptedPolicy, PolicyRunner]:
     """Return the doublet in the policy's kind of action, with that policy's gains."""
-    names = ("hover_thrust", *STICK_TERMS[1:])
     policy = ScriptedPolicy(
         "doublet",
         lambda: clock.now_ns() / NS_PER_S,
         action=trained.action,
         starts_in_air=is_in_air,
-        contract=Contract(**{name: getattr(trained, name) for name in names}),
+        contract=Contract(**{n: getattr(trained, n) for n in ("hover_thrust", *STICK_TERMS[1:])}),
     )
     runner = make_numpy_runner(policy, ExecutionSettings(name="scripted:doublet"))
     policy.reset()  # discard the state left by the trial on a dummy sample

@@ -119,10 +119,16 @@ def test_setpoints_are_compared_with_what_was_commanded(kind: ActionKind) -> Non
     assert len(found.pushes) == (8 if kind == "velocity" else 6)
     for push in found.pushes:
         assert push.ratio == pytest.approx((0.8, 0.8), abs=0.02), push
+    console = Console(file=StringIO(), width=120)
+    print_identification(found, Contract(action=kind), console)
+    told = (
+        "hovers at a policy's thrust of 0.450, which is scaled for the vehicle; trained with 0.390"
+    )
+    assert (told in console.file.getvalue()) == (kind != "velocity")  # type: ignore[attr-defined]
     if kind != "velocity":
-        assert found.hover_thrust == pytest.approx(0.45)
+        assert found.policy_hover_thrust == pytest.approx(0.45)
     else:
-        assert found.hover_thrust is None
+        assert found.policy_hover_thrust is None
 
 
 @pytest.mark.parametrize(("lag_s", "noise"), [(0.15, 0.02), (0.7, 0.0)])
@@ -182,7 +188,7 @@ def test_what_could_not_be_measured_is_told_beside_every_figure() -> None:
     assert first["measured"][0] == pytest.approx(8.1, abs=0.2)
     assert first["ratio"] == pytest.approx([1.0, 1.0], abs=0.02)
     assert (document["policy"], document["action"]) == ("toge", "sticks")
-    assert (document["hover_thrust"], len(document["missing"])) == (None, 4)
+    assert (document["policy_hover_thrust"], len(document["missing"])) == (None, 4)
 
 
 # --- the flight
