@@ -223,6 +223,7 @@ STALL, PLAYED = replace(LIMITS, stall_ns=300 * MS), LIMITS.while_played(NS_PER_S
         (10, LIMITS, 16, 1020, 1100, "attitude"),
         (500, LIMITS, 16, 1095, 1195, "attitude"),  # of 995 ms, which may be 100 ms old
         (500, PLAYED, 40, 2000, 2195, "attitude"),
+        (50, PLAYED, 16, 1100, 1150, "chunk"),  # three periods
         (500, PLAYED, 16, 1795, 1895, None),  # its horizon ends at 1795 ms
         (10, STALL, 1, 1020, 1100, "attitude"),
         (10, STALL, 4, 1020, 1195, None),
@@ -550,6 +551,9 @@ def test_a_solve_that_took_too_long_is_named() -> None:
     held = holding()
     held.offer(chunk(2, 1090, attitude_ns=940 * MS), 1090 * MS)
     assert held.fault(1104 * MS) == late("attitude", 164 * MS, 100 * MS, "solve", 150 * MS)
+    held = holding()  # and where it is the longest of short delays
+    held.offer(chunk(2, 1099, attitude_ns=1079 * MS, velocity_ns=840 * MS), 1099 * MS)
+    assert held.fault(1104 * MS) == late("velocity", 264 * MS, 250 * MS, "solve", 20 * MS)
 
 
 def test_a_delay_of_the_link_is_no_long_solve_and_an_answer_blames_nothing() -> None:
@@ -561,6 +565,8 @@ def test_a_delay_of_the_link_is_no_long_solve_and_an_answer_blames_nothing() -> 
     held.explain_absence(OLD_IMAGE, 1100 * MS)
     told = held.lateness(1104 * MS, stood_ns=10 * MS, heard_ns={"attitude": 1099 * MS})
     assert str(told) == f"{OLD_IMAGE}; attitude 109 ms old (limit 100 ms)"
+    for lag_ns, place in ((27 * MS, "lag"), (27 * MS - 1, "flight process")):  # a quarter of 108
+        assert figures(held.lateness(1103 * MS, lag_ns=lag_ns), "place") == (place,)
 
 
 def test_what_the_flight_process_says_comes_first() -> None:
