@@ -172,7 +172,7 @@ def _try(
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         _install(mutant, path, functions)
-        for k, following in zip(tests, [*tests[1:], None], strict=True):
+        for k, following in zip(tests, [*tests, None][1:], strict=True):
             # A mutant that hangs: the signal ends the process.
             signal.setitimer(signal.ITIMER_PROF, 1.0 + 5 * cost_s[k])
             _run(session, k, following)
