@@ -64,11 +64,10 @@ def checksum(data: bytes, crc_extra: int) -> bytes:
 def frame_at(data: bytes, at: int) -> RawPacket | None:
     """Return the packet that begins at ``at``; None if there is no complete one."""
     room = len(data) - at
-    marker = data[at] if room > 0 else None
-    if marker == MARKER_V2 and room >= HEADER.size:
+    if room >= HEADER.size and data[at] == MARKER_V2:
         _, length, flags, _, _, system, component, low, high = HEADER.unpack_from(data, at)
         start, number = at + HEADER.size, low | high << 16
-    elif marker == MARKER_V1 and room >= _HEADER_V1.size:
+    elif room >= _HEADER_V1.size and data[at] == MARKER_V1:
         _, length, _, system, component, number = _HEADER_V1.unpack_from(data, at)
         start, flags = at + _HEADER_V1.size, 0
     else:

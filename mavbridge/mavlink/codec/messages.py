@@ -25,7 +25,7 @@ class Heartbeat(NamedTuple):
     autopilot: int
     base_mode: int
     custom_mode: int
-    system_status: int = 0
+    system_status: int
 
 
 class CurrentMode(NamedTuple):
@@ -77,7 +77,7 @@ class RcChannels(NamedTuple):
 
     channels_us: tuple[int, ...]
     """At least eight."""
-    boot_us: int = 0
+    boot_us: int
     """Vehicle's clock since boot."""
 
 
@@ -161,8 +161,8 @@ class Altitude(NamedTuple):
 
     amsl_m: float
     """Height above mean sea level."""
-    above_home_m: float = 0.0
-    boot_us: int = 0
+    above_home_m: float
+    boot_us: int
 
 
 class SystemStatus(NamedTuple):
@@ -283,7 +283,7 @@ class ReceivedMessage(NamedTuple):
     body: Body | None
     """None: the bridge does not use the message, or its values are unusable."""
     packet: bytes
-    is_unusable: bool = False
+    is_unusable: bool
     """True if its values are, such as NaN."""
 
 

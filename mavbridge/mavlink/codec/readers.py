@@ -46,7 +46,7 @@ def _require_usable(*values: float) -> None:
 
 def _text(data: bytes) -> str:
     """Return a text up to its first zero byte, each byte as one character."""
-    return data.split(b"\0", 1)[0].decode("ascii", errors="replace")
+    return data.partition(b"\0")[0].decode("ascii", errors="replace")
 
 
 def _attitude_quaternion(m: dialect.MAVLink_attitude_quaternion_message) -> Body:

@@ -205,7 +205,7 @@ class VehicleCondition:
         return self._status
 
     def _status_at(self, now_ns: int, has_receiver: bool | None) -> VehicleStatus:
-        rc_ns, rc, _ = self._rc or (None, RcChannels(()), None)
+        rc_ns, rc, _ = self._rc or (None, RcChannels((), 0), None)
         is_shown = rc_ns is not None and now_ns - rc_ns <= GAP_NS
         is_valid = self._is_position_valid(now_ns)
         return VehicleStatus(

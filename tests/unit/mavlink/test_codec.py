@@ -15,6 +15,7 @@ from helpers.wire import ARDUPILOT, WireEnd, sent
 from mavbridge.core.rotation import Quaternion, quaternion_from_euler
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import Pwm
+from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.messages import (
     Altitude,
     Attitude,
@@ -35,11 +36,13 @@ from mavbridge.mavlink.codec.messages import (
     ParamWrite,
     RcChannels,
     SpecificForce,
+    StampOrder,
     StatusText,
     StreamRequest,
     SystemStatus,
     Timesync,
     VelocityTarget,
+    later_by_us,
 )
 from mavbridge.mavlink.codec.packets import (
     MOST_DATAGRAM_BYTES,
@@ -115,7 +118,7 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
     ),  # no terminal codes
     (m.statustext_encode(6, b"Pilot took over\t"), StatusText("Pilot took over")),
     (m.statustext_encode(6, b"Armed \t\r\n"), StatusText("Armed")),
-    (m.statustext_encode(6, b"x" * 49 + b"\t", 3), StatusText("x" * 49, 3, 0, is_full=True)),
+    (m.statustext_encode(6, b"x" * 48 + b" \t", 3), StatusText("x" * 48 + " ", 3, 0, is_full=True)),
     # many bytes beyond ASCII: the last piece all the same
     (m.statustext_encode(4, "äöüÄÖÜß".encode(), 7, 1), StatusText("\ufffd" * 14, 7, 1)),
     (m.statustext_encode(4, b"x" * 50, 7, 1), StatusText("x" * 50, 7, 1, is_full=True)),
@@ -202,6 +205,9 @@ UNUSABLE, UNUSED = (False, 1), (False, 0)
         (m.manual_control_encode(1, 1000, -1000, 1000, 1000, 0), (True, 0)),
         (m.manual_control_encode(1, 0, 0, 32767, 0, 0), UNUSABLE),
         (m.manual_control_encode(1, 0, 0, -1, 0, 0), UNUSABLE),
+        (m.manual_control_encode(1, 1001, 0, 0, 0, 0), UNUSABLE),
+        (m.manual_control_encode(1, 0, -1001, 0, 0, 0), UNUSABLE),
+        (m.manual_control_encode(1, 0, 0, 0, 32767, 0), UNUSABLE),
         # no target, a value out of range, an unused message: no fault
         (m.attitude_target_encode(7, 7, [nan] * 4, 1, 2, 3, 0.4), UNUSED),
         (m.position_target_local_ned_encode(7, 1, 0, 1, 1, 1, nan, 2, -3, *[0] * 5), UNUSED),
@@ -295,14 +301,60 @@ def test_bytes_that_begin_nothing_count_once() -> None:
 
 def test_a_message_without_a_name_keeps_its_sender_and_its_place_in_the_sequence() -> None:
     """PX4 sends nine of them, 5 % of its packets, which counted as lost."""
-    second = bytes([0xFD, 5, 0, 0, 7, 1, 1, 0x22, 0x01, 0x00]) + b"hello" + b"\x12\x34"
+    second = bytes([0xFD, 5, 0, 0, 7, 1, 1, 0, 0, 1]) + b"hello" + b"\x12\x34"
     first = bytes([0xFE, 2, 9, 3, 4, 222]) + b"hi" + b"\x12\x34"
+    assert (frame := frame_at(second, 0)) is not None
+    assert frame.message_id == 65536
     ours = codec()
     for packet, source, sequence in ((second, (1, 1), 7), (first, (3, 4), 9)):
         (message,) = ours.decode_datagram(packet)
         assert (message.source, message.sequence) == (source, sequence)
         assert (message.body, message.packet) == (None, packet)
         assert message.name == "UNKNOWN"
+
+
+WRAP_US = 2**32 * 1000
+
+
+@pytest.mark.parametrize(
+    ("stamp_us", "other_us", "later_us"),
+    [
+        (5, 3, 2),
+        (3, 5, -2),
+        (0, WRAP_US - 10**6, 10**6),
+        (1, WRAP_US - 10**6, 10**6 + 1 - WRAP_US),
+        (WRAP_US - 10**6, 0, -(10**6)),
+        (WRAP_US - 10**6 - 1, 0, WRAP_US - 10**6 - 1),
+    ],
+)
+def test_less_than_a_second_across_the_wrap_is_a_wrap(
+    stamp_us: int, other_us: int, later_us: int
+) -> None:
+    assert later_by_us(stamp_us, other_us) == later_us
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "accepted"),
+    [
+        ((5000, 4990, 5000, 5010), (True, False, False, True)),
+        ((5000, 3000, 5010, 3010), (True, False, True, False)),
+        ((5000, 4000, 4000, 4000), (True, False, False, False)),  # late by no more than a second
+        ((5000, 3999.999, 3999.999), (True, False, True)),  # the clock has restarted
+        ((5000, 10, 4990, 20), (True, False, False, False)),
+        ((2**32 - 10, 4, 2**32 - 5, 14), (True, True, False, True)),
+        ((0, 0, 5000, 0), (True, True, True, True)),  # unstamped
+        ((0.001, 0.001, 0.002), (True, False, True)),
+    ],
+)
+def test_late_and_doubled_stamps_are_left_out_until_two_in_a_row_are_far_back(
+    stamps_ms: tuple[float, ...], accepted: tuple[bool, ...]
+) -> None:
+    order = StampOrder()
+    assert tuple(order.accepts(round(1000 * at_ms)) for at_ms in stamps_ms) == accepted
+
+
+def test_a_text_is_whole_unless_it_says_something_else() -> None:
+    assert StatusText("whole") == ("whole", 0, 0, False)
 
 
 # --- sent

@@ -104,7 +104,7 @@ def test_what_pymavlink_does_not_know_is_decoded_here(
         flagged = bytes((data[0], data[1], 1, *data[3:-2]))
         data = flagged + checksum(flagged[1:], crc_extra) + bytes(13)
     (message,) = codec().decode_datagram(data)
-    assert message == ReceivedMessage(Endpoint(4, 1), data[4], name, body, data)
+    assert message == ReceivedMessage(Endpoint(4, 1), data[4], name, body, data, is_unusable=False)
     for k in range(10, len(data) - 13 * is_signed):
         damaged = bytes((*data[:k], data[k] ^ 0x10, *data[k + 1 :]))
         assert list(codec().decode_datagram(damaged)) == []

@@ -104,6 +104,7 @@ def v1_beats():
         yield heartbeat(vehicle, is_v1=True)
 
 
+UNKNOWN = bytes([0xFD, 5, 0, 0, 7, 1, 1, 0, 0, 1]) + b"noise" + bytes(2)
 OTHER_STREAMS = beat(component=100), beat(link_id=3)
 LATE_TICKS = NOW_TICKS - MINUTE_TICKS
 
@@ -118,6 +119,7 @@ LATE_TICKS = NOW_TICKS - MINUTE_TICKS
         ([beat(ticks=LATE_TICKS - 1), beat(ticks=LATE_TICKS)], 1, {"clock behind": 1}),
         ([radio_status(), radio_status(is_v1=True)], 2, {}),
         ([*v1_beats()], 0, {"unsigned": 2}),
+        ([UNKNOWN], 0, {}),
     ],
 )
 def test_refused_is_what_the_key_has_not_signed_or_not_just_now(packets, accepted, refused):
@@ -149,6 +151,7 @@ def test_our_timestamps_follow_the_clock_and_never_step_back():
     assert timestamp(codec.encode_heartbeat()) == NOW_TICKS + 10**9 // TICK_NS + 1
     restarted = make_codec(day=TimeOfDay(EPOCH_NS - 1), state=SigningState(NOW_TICKS + 500))
     assert timestamp(restarted.encode_heartbeat()) == NOW_TICKS + 501
+    assert timestamp(make_codec(day=TimeOfDay(0)).encode_heartbeat()) == 1
 
 
 def test_without_a_key_signed_packets_are_read_and_noticed():

@@ -88,7 +88,7 @@ class Session:
             self.shake_hands()
 
     def put(self, body: Body, name: str = "ANY", *, sequence: int = 0) -> None:
-        message = ReceivedMessage(Endpoint(1, 1), sequence, name, body, b"")
+        message = ReceivedMessage(Endpoint(1, 1), sequence, name, body, b"", is_unusable=False)
         self.output.receive(body, self.session, self.now_ns)
         self.session.receive(message, self.now_ns)
 
@@ -498,7 +498,7 @@ def test_a_takeoff_waits_for_the_height_and_is_asked_for_once_a_second() -> None
     assert told.endswith("the vehicle does not tell its height above the sea")
     assert sent == []
     session.now_ns = clock.now_ns()
-    session.put(Altitude(489.4))
+    session.put(Altitude(489.4, 0.0, 0))
     for _ in range(150):
         commands.takeoff(5.0)
         clock.advance_ns(10 * MS)
