@@ -23,7 +23,11 @@ from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
     ],
 )
 def test_sticks_to_pwm(sticks: Sticks, throttle_yaw_pitch_roll_us: tuple[int, ...]) -> None:
-    assert ARDUPILOT.to_pwm_us(sticks) == throttle_yaw_pitch_roll_us
+    assert replace(ARDUPILOT).to_pwm_us(sticks) == throttle_yaw_pitch_roll_us
+
+
+def test_the_sticks_are_told_by_the_numbers_of_their_channels() -> None:
+    assert ARDUPILOT.stick_channels_us(range(1001, 1009)) == (1003, 1004, 1002, 1001)
 
 
 unit = st.floats(-1, 1)
@@ -55,12 +59,14 @@ def changed(stick: str, **values: int) -> RcCalibration:
 def test_a_channel_may_be_uneven_reversed_and_as_wide_as_a_radio(
     calibration: RcCalibration, yaw: float, yaw_us: int
 ) -> None:
-    assert calibration.to_pwm_us(Sticks(0, yaw, 0, 0))[1] == yaw_us
+    assert replace(calibration).to_pwm_us(Sticks(0, yaw, 0, 0))[1] == yaw_us
     assert calibration.to_sticks((1500, yaw_us, 1500, 1500)).yaw == pytest.approx(yaw)
 
 
 def test_pwm_beyond_the_calibration_is_a_full_stick() -> None:
     assert ARDUPILOT.to_sticks((500, 2500, 500, 2500)) == (-1, 1, 1, 1)
+    channel = RcChannel(number=1, min_us=1100, trim_us=1500, max_us=1900)
+    assert (channel.to_us(2, centre_us=1500), channel.to_stick(2500, centre_us=1500)) == (1900, 1)
 
 
 def test_the_throttle_has_its_centre_between_its_ends_and_stays_above_the_failsafe() -> None:

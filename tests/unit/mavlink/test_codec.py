@@ -269,6 +269,9 @@ def test_a_packet_is_not_completed_by_another_sender() -> None:
     assert list(ours.decode_datagram(data[9:], ("vehicle", 1))) == []
     (incoming,) = ours.decode_datagram(data[9:], ("stranger", 1))
     assert isinstance(incoming.body, Heartbeat)
+    assert list(ours.decode_datagram(data[:9])) == []
+    ours.forget_partials()
+    assert list(ours.decode_datagram(data[9:])) == []
 
 
 def test_unfinished_packets_of_the_newest_16_senders_are_kept() -> None:
@@ -537,6 +540,7 @@ def test_a_stick_out_of_range_never_becomes_a_message(bad: float, axis: int) -> 
         pwm_of(sticks, ARDUPILOT)
     with pytest.raises(CommandRefusedError, match="not in"):
         manual_control_of(sticks)
+    assert pwm_of(Sticks(1, -1, 1, -1), ARDUPILOT) == (1900, 1100, 1100, 1100)
 
 
 @pytest.mark.parametrize("number", [0, 1, -1, 10040, 2**31 - 1, -(2**31)])

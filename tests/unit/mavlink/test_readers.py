@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.flown_vehicle import codec
 from mavbridge.mavlink.codec.frames import checksum
 from mavbridge.mavlink.codec.messages import Body, CurrentMode, Endpoint, Event, ReceivedMessage
-from mavbridge.mavlink.codec.readers import IDS, READERS, UnusableError
+from mavbridge.mavlink.codec.readers import IDS, READERS, UnusableError, _layout
 
 byte = st.integers(0, 255)
 number = st.floats(width=32) | st.just(0.0)
@@ -122,6 +122,14 @@ def test_a_header_that_says_something_else_is_no_packet(at: int, value: int) -> 
     crc_extra = dialect.MAVLink_local_position_ned_message.crc_extra
     data = bytes(packet) + checksum(bytes(packet[1:]), crc_extra)
     assert all(message.body is None for message in codec().decode_datagram(data))
+
+
+def test_an_array_of_the_wire_is_one_field() -> None:
+    assert _layout("M", "<I3BH", ("a", "b", "c"), (1, 3, 1)).pick((1, 2, 3, 4, 5)) == (
+        *(1, (2, 3, 4), 5),
+    )
+    layout = _layout("M", "<IH", ("a", "b"))
+    assert (layout.pick((1, 2)), layout.fields(1, 2).b, layout.payload.size) == ((1, 2), 2, 6)
 
 
 @pytest.mark.parametrize("length", [28, 29])

@@ -154,6 +154,16 @@ def test_our_timestamps_follow_the_clock_and_never_step_back():
     assert timestamp(make_codec(day=TimeOfDay(0)).encode_heartbeat()) == 1
 
 
+@pytest.mark.parametrize("key", [KEY, None])
+def test_what_is_rehearsed_uses_up_no_number_and_is_a_stream_of_its_own(key):
+    codec = make_codec(key)
+    with codec.rehearsing():
+        packets = [codec.encode_heartbeat(), codec.encode_heartbeat()]
+    packets.append(codec.encode_heartbeat())
+    assert [packet[4] for packet in packets] == [0, 1, 0]
+    assert key is None or [packet[-13] for packet in packets] == [1, 1, 0]
+
+
 def test_without_a_key_signed_packets_are_read_and_noticed():
     codec = make_codec(None)
     assert names(codec, attitude(make_vehicle(None))) == ["ATTITUDE_QUATERNION"]
