@@ -7,6 +7,7 @@ each mutant that may survive; one without a reason ends this with status 1.
 """
 
 import argparse
+import ast
 import gc
 import os
 import pickle
@@ -184,8 +185,8 @@ def _try(
 
 
 def _install(mutant: Mutant, path: str, functions: dict[str, list[FunctionType]]) -> None:
-    code = compile(mutant.tree, path, "exec")
     if mutant.scope in functions:
+        code = compile(mutant.tree, path, "exec")
         changed = next(part for part in _parts(code) if part.co_qualname == mutant.scope)
         for function in functions[mutant.scope]:
             function.__code__ = changed
@@ -195,19 +196,22 @@ def _install(mutant: Mutant, path: str, functions: dict[str, list[FunctionType]]
         for name, module in sys.modules.items()
         if getattr(module, "__file__", None) == path and not name.startswith("tests")
     )
-    space: dict[str, Any] = {"__name__": name, "__file__": path}
-    exec(code, space)
-    owner, _, constant = mutant.scope.rpartition(".")
+    live = sys.modules[name]
+    begins = [part for part in mutant.tree.body if part.lineno <= mutant.lines[0]]
+    space = dict(vars(live))  # an exception of this module stays the one that others catch
+    exec(compile(ast.Module(begins[-1:], []), path, "exec"), space)
+    owner = mutant.scope.rpartition(".")[0]
     if owner:
-        _change_default(getattr(sys.modules[name], owner), space[owner], constant)
+        _change_default(getattr(live, owner), space[owner])
         return
-    old = getattr(sys.modules[name], constant)
-    for module in list(sys.modules.values()):
-        if vars(module).get(constant) is old:
-            setattr(module, constant, space[constant])
+    for constant, value in space.items():
+        if (old := getattr(live, constant)) is not value:
+            for module in list(sys.modules.values()):
+                if vars(module).get(constant) is old:
+                    setattr(module, constant, value)
 
 
-def _change_default(owner: type, changed: type, name: str) -> None:
+def _change_default(owner: type, changed: type) -> None:
     """Give a dataclass or named tuple the default of its mutant."""
     for function in ("__init__", "__new__"):
         old, new = getattr(owner, function, None), getattr(changed, function, None)

@@ -74,8 +74,8 @@ def _walk(
             if isinstance(child, ast.FunctionDef | ast.ClassDef) and not is_inside:
                 inner = f"{scope}.{child.name}".lstrip(".")
                 inside = isinstance(child, ast.FunctionDef)
-            elif not is_inside and isinstance(child, ast.AnnAssign | ast.Assign):
-                target = child.target if isinstance(child, ast.AnnAssign) else child.targets[0]
+            elif not is_inside and isinstance(child, ast.AnnAssign | ast.Assign | ast.AugAssign):
+                target = child.targets[0] if isinstance(child, ast.Assign) else child.target
                 inner = f"{scope}.{ast.unparse(target)}".lstrip(".")
             way = (*path, (field, index))
             if isinstance(child, ast.stmt | ast.expr) and (

@@ -558,8 +558,9 @@ def test_a_parameter_that_is_no_integer_is_written_as_it_is() -> None:
     real = ParamWrite("COM_RC_LOSS_T", 0.5)
     assert real.as_bytes() == real
     assert ParamValue("COM_RC_LOSS_T", 0.5, 9).from_bytes().value == 0.5
-    too_much = ParamWrite("SYS_AUTOSTART", 1e12, kind=6).as_bytes()
-    assert ParamValue("SYS_AUTOSTART", too_much.value, 6).from_bytes().value == 2**31 - 1
+    for too_much, nearest in ((1e12, 2**31 - 1), (-1e12, -(2**31))):
+        written = ParamWrite("SYS_AUTOSTART", too_much, kind=6).as_bytes()
+        assert ParamValue("SYS_AUTOSTART", written.value, 6).from_bytes().value == nearest
 
 
 def test_packets_are_numbered_in_one_byte() -> None:
