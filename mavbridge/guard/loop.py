@@ -14,6 +14,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import (
+    Action,
     LinkArrivals,
     LinkSnapshot,
     Outlet,
@@ -214,20 +215,9 @@ class GuardLoop:
         sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
         if is_action and sent is None:
             self.guard.unsent()
-        tick = output.tick
-        phase = self.guard.engagement.phase
+        tick, phase = output.tick, self.guard.engagement.phase
         if tick.is_slot or wanted is not None or phase is not self._phase:
-            due_ns, sent_ns = tick.due_ns if tick.is_slot else woke_ns, self._clock.now_ns()
-            tick = replace(
-                tick,
-                serial=self._reports,
-                due_ns=due_ns,
-                woke_ns=woke_ns,
-                sent_ns=sent_ns,
-                sent=sent,
-            )
-            self._reports += 1
-            self._flight.send(encode_from_guard(tick))
+            self._report_tick(tick, woke_ns, sent)
         self._follow(output)
         if phase is not self._phase:
             self._change_phase(phase, tick.release_reason)
@@ -254,6 +244,18 @@ class GuardLoop:
         if has_work:
             self._stepped_ns = at_ns
         return bool(has_work)
+
+    def _report_tick(self, tick: GuardTick, woke_ns: int, sent: Action | None) -> None:
+        told = replace(
+            tick,
+            serial=self._reports,
+            due_ns=tick.due_ns if tick.is_slot else woke_ns,
+            woke_ns=woke_ns,
+            sent_ns=self._clock.now_ns(),
+            sent=sent,
+        )
+        self._reports += 1
+        self._flight.send(encode_from_guard(told))
 
     def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
         """Call ``send``. An error becomes a fault of the flight instead of ending the guard."""
