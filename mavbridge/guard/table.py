@@ -72,7 +72,7 @@ def not_set(m: Memory, now: EngagementInputs) -> EndRequest | None:
     problem = now.link.problem
     if not m.wants_arm or problem is None or problem.code not in NOT_SET:
         return None
-    return EndRequest(problem, is_fault=True)
+    return EndRequest(problem)
 
 
 def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
@@ -312,8 +312,7 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return now.link.overruled
     if now.link.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
-    is_held = m.phase in (LEAVING, HOLDING) and m.heeds_switch
-    if m.switch.is_off and (m.phase is FLYING or (is_preparing and m.is_act) or is_held):
+    if m.switch.is_off and (m.phase is FLYING or (is_preparing and m.is_act) or m.heeds_switch):
         return _switch_off(m)
     if not now.status.armed and not is_preparing:
         return because(Code.DISARMED)
@@ -326,11 +325,10 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
             changed = because(Code.LANDED)  # PX4 shows this change 4 ms before its disarming
     # The flag of a failsafe that kept our mode stays up, and does not tell who changes the mode.
     codes = m.reason.codes if m.phase in (LEAVING, HOLDING) and m.reason is not None else ()
-    is_told = changed is not None and Code.FAILSAFE in codes
-    failsafe = None if is_told else _failsafe(m, now, keeps_mode=False)
+    failsafe = None if Code.FAILSAFE in codes else _failsafe(m, now, keeps_mode=False)
     if (reason := failsafe or changed) is not None:
         return reason
-    return because(Code.DISARMED) if is_preparing and m.was_armed and not now.status.armed else None
+    return because(Code.DISARMED) if m.was_armed and not now.status.armed else None
 
 
 class Transition(NamedTuple):

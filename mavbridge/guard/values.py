@@ -130,9 +130,9 @@ class EngagementInputs:
     """Why no flight may begin now: no fresh chunk."""
     chunk_fault: Reason | None
     """Why a flight must end now: no chunk for longer than the grace, or a failed command."""
-    command_failed: bool = False
+    command_failed: bool
     """True if the last command failed, so that the vehicle has not received it."""
-    is_policy_reset: bool = True
+    is_policy_reset: bool
     """True if the newest chunk was solved after the reset for the flight that starts."""
     slowness: Reason | None = None
     """Why the policy can never fly: too slow, or a failed command."""

@@ -81,6 +81,8 @@ AIRBORNE = EngagementInputs(
     status=_STATUS,
     chunk_problem=None,
     chunk_fault=None,
+    command_failed=False,
+    is_policy_reset=True,
     envelope_problem=None,
 )
 """Armed in ALT_HOLD, in the air, with a centred receiver and a policy within its limits."""

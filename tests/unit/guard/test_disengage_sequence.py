@@ -279,6 +279,61 @@ def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -
     assert [move.control for move in moves] == [LEVEL] * 5 + [RELEASE] * 2
 
 
+# --- PX4, which sees neither our sticks nor the pilot's for a moment after the release
+
+HAND = altered(AIRBORNE, mode="ALTCTL", modes=replace(PX4_MODES, is_silence_failsafe=False))
+IN_HOLD = altered(HAND, mode="AUTO.LOITER")
+IN_OFFBOARD = altered(HAND, mode="OFFBOARD")
+
+
+def released(facts: Any = HAND, **rules: Any) -> Stepped:
+    stepped = flying(facts, modes=(facts.status.mode,), **rules)
+    stepped.step("release")
+    stepped.run(0.05, mode=stepped.engagement.disengage.mode or "ALTCTL")
+    stepped.facts = altered(stepped.facts, stick_loss_ns=stepped.facts.now_ns + 1)
+    return stepped
+
+
+DROPPED = {"mode": "AUTO.LOITER", "is_failsafe": True, "is_released": True}
+
+
+def test_px4s_failsafe_for_want_of_sticks_is_undone_ten_times_a_second_for_1_5_s() -> None:
+    stepped = released()
+    assert {move.mode for move in stepped.run(0.09)} == {None}
+    moves = stepped.run(2.0, **DROPPED)
+    assert [k for k, move in enumerate(moves) if move.mode == "ALTCTL"] == [*range(0, 150, 10)]
+    assert (stepped.phase, stepped.engagement.refusal) == (Phase.RELEASED, None)
+    assert stepped.step(mode="ALTCTL") == Actions()
+    assert stepped.engagement.refusal is None, "it is the mode of the release"
+
+
+@pytest.mark.parametrize(
+    ("start", "changes", "mode"),
+    [
+        (released, {}, "ALTCTL"),
+        (released, {"stick_loss_ns": None}, None),
+        (released, {"stick_loss_ns": 80 * NS_PER_MS}, None),  # at the release
+        (released, {"is_failsafe": False}, None),
+        (released, {"armed": False}, None),
+        (released, {"mode": "AUTO.RTL"}, None),  # a geofence, a battery
+        (released, {"is_mode_chosen": True}, None),  # by a pilot
+        (released, {"modes": PX4_MODES}, None),
+        (released, {"modes": replace(HAND.link.modes, override="")}, None),
+        (lambda: released(IN_HOLD), {"is_mode_chosen": True}, "AUTO.LOITER"),
+        (lambda: released(IN_OFFBOARD, is_setpoint=True), {}, None),
+    ],
+)
+def test_which_failsafe_after_a_release_is_undone(start: Any, changes: Any, mode: Any) -> None:
+    assert {move.mode for move in start().run(0.1, **DROPPED | changes)} == {None, mode}
+
+
+@pytest.mark.parametrize("taken", [{"mode": "POSCTL"}, {"is_failsafe": True}])
+def test_no_failsafe_is_undone_after_a_takeover(taken: Any) -> None:
+    stepped = flying(HAND)
+    stepped.step(**taken)
+    assert stepped.step(**DROPPED, stick_loss_ns=stepped.facts.now_ns + 1).mode is None
+
+
 # --- a vehicle that is not heard, and our own standstill
 
 
@@ -321,6 +376,15 @@ def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
     assert (found.control, found.mode) == (NEUTRAL, facts.link.modes.hold)
 
 
+def test_a_mode_that_was_asked_for_before_a_silence_is_ours_after_it() -> None:
+    stepped = at_fault(NO_RECEIVER)
+    silence(stepped, 5)
+    stepped.run(0.1, heard_ns=None, mode_arrived_ns=None, mode="BRAKE")
+    stepped.step(mode="LOITER")
+    changed = because(Code.MODE_CHANGED, before="BRAKE", after="LOITER")
+    assert stepped.engagement.reason == because(Code.THEN, first=FAULT["chunk_fault"], then=changed)
+
+
 @pytest.mark.parametrize(
     ("facts", "own"), [(NO_RECEIVER, "RTL"), (NO_RECEIVER, "LAND"), (PX4, "AUTO.RTL")]
 )
@@ -355,6 +419,16 @@ def test_a_standstill_is_longer_than_250_ms_and_a_silence_behind_it_lengthens_it
     assert standstill(stepped, 4, **FAULT).mode is None
     moves = stepped.run(1.0, heard_ns=stepped.facts.now_ns)
     assert {move.mode for move in moves} == {None}
+
+
+@pytest.mark.parametrize(("silent_s", "is_asked"), [(0.25, True), (0.26, False)])
+def test_after_a_silence_of_more_than_250_ms_the_mode_is_not_known(
+    silent_s: float, is_asked: bool
+) -> None:
+    stepped = flying(NO_RECEIVER)
+    silence(stepped, silent_s)
+    moves = stepped.run(0.7, heard_ns=None, **FAULT)
+    assert ("BRAKE" in {move.mode for move in moves[-10:]}) is is_asked
 
 
 def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
@@ -397,6 +471,7 @@ def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
     ended = flying(facts, **rules)
     ended.engagement.stop(EndRequest(reason=because(Code.DURATION)))
     assert ended.step().mode == (hold if has_receiver else land)
+    assert ended.engagement.outcome.end == "signal"
 
 
 def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_it_back() -> None:

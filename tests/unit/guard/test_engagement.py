@@ -107,13 +107,30 @@ def test_a_switch_that_has_not_rested_is_told() -> None:
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=not_rested)
 
 
-def test_engage_on_arm_counts_the_first_arming_alone() -> None:
+@pytest.mark.parametrize("put_so", [LOW, HIGH])
+def test_a_switch_that_stays_where_it_is_is_no_act_to_tell_of(put_so: dict[str, Any]) -> None:
+    stepped = Stepped(engage_channel=8)
+    assert set(stepped.run(0.5, **put_so)) == {NOTHING}
+    assert stepped.engagement.refusal is None
+
+
+def test_the_key_wins_over_the_switch_of_the_same_step() -> None:
+    stepped = Stepped(engage_channel=8)
+    stepped.run(0.3, **LOW)
+    stepped.run(0.2, **HIGH)
+    assert (stepped.step("release"), stepped.engagement.refusal) == (NOTHING, None)
+
+
+@pytest.mark.parametrize("silent_s", [0.0, 4.0])
+def test_engage_on_arm_counts_the_first_arming_alone(silent_s: float) -> None:
     stepped = Stepped(ON_GROUND, engage_on_arm=True)
     stepped.run(0.1)
     assert stepped.engagement.refusal is None
     assert stepped.step(armed=True) == FLIES
+    assert (stepped.step(), stepped.engagement.refusal) == (FLIES, None)
     stepped.step(armed=False)
-    stepped.run(2, is_released=True)
+    stepped.run(silent_s, armed_arrived_ns=stepped.facts.now_ns)
+    stepped.run(2, is_released=True, armed_arrived_ns=None)
     assert set(stepped.run(2, armed=True)) == {NOTHING}
 
 
@@ -134,7 +151,7 @@ def test_an_act_in_the_step_in_which_an_armed_vehicle_is_found_engages() -> None
 
 @pytest.mark.parametrize(
     ("seconds", "unheard"),
-    [(0.3, ("heard_ns", "mode_arrived_ns")), (2.9, ()), (3.1, ())],
+    [(0.3, ("heard_ns", "mode_arrived_ns")), (2.9, ()), (2.95, ())],
 )
 @pytest.mark.parametrize("is_seen_disarmed", [True, False])
 def test_an_arming_during_a_silence_is_no_act(
@@ -144,6 +161,7 @@ def test_an_arming_during_a_silence_is_no_act(
     stepped.run(0.1)
     told = dict.fromkeys(("armed_arrived_ns", *unheard), stepped.facts.now_ns)
     stepped.run(seconds, **told)
+    assert stepped.engagement.refusal is None
     stepped.run(0.05, heard_ns=None, mode_arrived_ns=None)  # CURRENT_MODE tells of no arming
     if is_seen_disarmed:
         stepped.step(armed_arrived_ns=None)
@@ -327,6 +345,13 @@ def test_a_vehicle_that_is_silent_from_the_start_is_no_error() -> None:
     assert Stepped().step(heard_ns=-NS_PER_S) == NOTHING
 
 
+def test_watching_that_never_flew_ends_no_flight() -> None:
+    stepped = Stepped(altered(AIRBORNE, chunk_problem=because(Code.NO_IMAGE)), readonly=True)
+    stepped.step()
+    assert stepped.step(stop=DEATH) == NOTHING
+    assert (stepped.phase, stepped.engagement.outcome) == (Phase.ENDED, Outcome())
+
+
 @pytest.mark.parametrize("ends", ["stop", "duration"])
 @pytest.mark.parametrize("at_last", [FLIES, NOTHING])
 def test_watching_ends_as_a_flight_does(ends: str, at_last: Actions) -> None:
@@ -368,6 +393,13 @@ def left_by_fault() -> Stepped:
     return stepped
 
 
+def stood_still() -> Stepped:
+    stepped = flying(NO_RECEIVER)
+    stepped.facts = altered(stepped.facts, now_ns=NS_PER_S)
+    stepped.step(mode_arrived_ns=0)
+    return stepped
+
+
 def asked() -> Stepped:
     stepped = Stepped(altered(AIRBORNE, mode="LOITER", is_released=True), mode="ALT_HOLD")
     stepped.step()
@@ -383,6 +415,7 @@ def asked() -> Stepped:
         (lambda: flying(NO_RECEIVER), asking("BRAKE", (0, 100, 200))),
         (flying, asking("", (), (0, 20, 40)) + releasing(100)),
         (left_by_key, asking("LAND", ())),
+        (stood_still, asking("BRAKE", (100, 200))),
         (asked, []),
         (
             lambda: flying(PX4),

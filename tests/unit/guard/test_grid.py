@@ -56,6 +56,7 @@ def test_a_slot_that_was_served_less_than_half_a_period_early_is_left_out() -> N
     ("sends", "missed"),
     [
         ({10: False, 20: True}, 1),
+        ({5: True, 10: False, 20: True}, 1),
         ({10: False, 13: True, 20: True}, 0),  # a new chunk within the period
         ({10: True, 13: False, 20: True}, 0),
         ({10: False, 20: False, 30: True}, 2),

@@ -334,9 +334,11 @@ def test_sticks_that_were_not_sent_are_not_gone_on_from_but_where_none_are_sent(
     for at_ms in (40, 50, 60):
         guard.step(at_ms)
     guard.guard.unsent()
-    decision = guard.step(70).decision
-    assert isinstance(decision, Sticks)
-    assert decision.throttle == pytest.approx(0.05 if readonly else 0.04)  # sent 20 ms before
+    output = guard.step(70)
+    assert isinstance(output.decision, Sticks)
+    decided = output.decision.throttle
+    assert decided == pytest.approx(0.05 if readonly else 0.04)  # sent 20 ms before
+    assert output.tick.missed_slots == (0 if readonly else 1)
     assert guard.step(200).tick.phase is (Phase.WAITING if readonly else Phase.LEAVING)
 
 
@@ -399,12 +401,17 @@ def test_where_neutral_may_not_have_been_sent_px4_is_not_asked_for_a_mode_at_onc
     assert ("AUTO.LOITER" in asked) == (fault is None)
 
 
-def test_a_switch_that_is_not_seen_is_no_way_out() -> None:
+def test_which_acts_end_neutral_sticks() -> None:
+    assert Stepped().guard.ways_out == "you disarm or change the mode"
+    assert Stepped().engaged().guard.ways_out == "you disarm or change the mode"
     roles = replace(PX4_MODES, is_silence_failsafe=False)
     status = {"mode": "ALTCTL", "has_receiver": True, "rc_channels_us": (1500,) * 8}
-    guard = Stepped(roles=roles, modes=("ALTCTL",), engage_channel=7, status=status).engaged()
-    guard.step(40, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
-    assert guard.guard.ways_out.endswith(", or put the engage switch low")
+    for channel in (None, 7):
+        rules = {"modes": ("ALTCTL",), "engage_channel": channel}
+        guard = Stepped(roles=roles, status=status, **rules).engaged()
+        assert guard.guard.ways_out == "you disarm or change the mode by a ground station"
+        guard.step(40, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+        assert ("or put the engage switch low" in guard.guard.ways_out) == (channel == 7)
     for at_ms in range(50, 1200, 10):
         guard.step(at_ms, rc_channels_us=())
     assert guard.guard.ways_out == "you disarm or change the mode by a ground station"
@@ -640,6 +647,7 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem=because(Code.NO_HEARTBEAT))
     waiting = guard.step(START_NS, GuardInput(link=link, act="engage"))
     assert (waiting.tick.phase, waiting.decision) == (Phase.WAITING, None)
+    assert "disarmed" in waiting.messages[0]
     assert waiting.tick.release_reason == because(Code.NO_HEARTBEAT)
     ended = guard.step(
         START_NS + MS, GuardInput(link=link, stop=EndRequest(reason=because(Code.SIGNAL)))

@@ -1,6 +1,7 @@
 """The table of the engagement, row by row: docs/safety.md shows it to pilots."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from helpers.guard_facts import (
     flying,
 )
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard import engagement
 from mavbridge.guard.table import PROGRESS, TABLE, Transition
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
@@ -38,8 +39,11 @@ KEPT = {"is_failsafe": True}
 SIGNAL = EndRequest(because(Code.SIGNAL))
 SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
 UNDRIVEN, NO_CHANNELS = {"rc_channels_us": (1500,) * 6 + (0, 1500)}, {"rc_channels_us": ()}
+IN_LOITER: dict[str, Any] = {"mode": "LOITER", "is_armed": True, "is_echoed": True}
 LANDS: dict[str, Any] = {"on_fault": "rtl", "then": "land"}
 OFFBOARD = altered(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
+HAND = altered(AIRBORNE, mode="ALTCTL", modes=replace(PX4_MODES, is_silence_failsafe=False))
+"""PX4 whose receiver takes over when our sticks end."""
 SETPOINTS: dict[str, Any] = {
     "is_setpoint": True,
     "modes": ("OFFBOARD",),
@@ -168,6 +172,7 @@ silent = {"heard_ns": 0}
 CASES = {
     # WAITING and RELEASED
     "somebody arms": Case(partial(waiting, ON_GROUND), {"armed": True}, WAITING),
+    "found armed": Case(Stepped, {}, WAITING, why=Code.NOT_ENGAGED),
     "it says what it waits for": Case(waiting, {"problem": because(LOST), "chunk_problem":
         NO_IMAGE}, WAITING, why=LOST),
     "no image": Case(waiting, {"chunk_problem": NO_IMAGE}, WAITING, why=Code.NO_IMAGE),
@@ -230,6 +235,8 @@ CASES = {
         is_policy_reset=False), KEY, LEAVING, NEUTRAL, "AUTO.RTL", Code.OPERATOR),
     "key, as our OFFBOARD comes": Case(flowing, {**KEY, "mode": "OFFBOARD"}, LEAVING, NEUTRAL,
         "AUTO.RTL", Code.OPERATOR),
+    "key, in an OFFBOARD of another's": Case(lambda: after(partial(waiting, OFFBOARD, **SETPOINTS),
+        0.01, act="engage", is_policy_reset=False), KEY, RELEASING, RELEASE, why=Code.OPERATOR),
     "another allowed mode on the way in": Case(lambda: after(waiting, 0.01, act="engage",
         is_policy_reset=False), {"mode": "ALTCTL"}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "key, idle sticks not seen yet": Case(arming, {**KEY, "is_released": True}, RELEASING, RELEASE,
@@ -242,6 +249,12 @@ CASES = {
         why=Code.MODE_CHANGED),
     "another mode before ours is there": Case(partial(waiting, altered(ON_GROUND, mode="STABILIZE"),
         arm=True), {"mode": "LOITER"}, PREPARING, IDLE),
+    "a hand on the ground on the way in, PX4": Case(lambda: after(partial(waiting, altered(OFFBOARD,
+        mode="AUTO.LAND", is_landed=True, is_released=True), mode="ALTCTL"), 0.01, act="engage"),
+        {"mode": "POSCTL"}, RELEASED, why=Code.MODE_CHANGED),
+    "failsafe on the ground, then its mode in the air": Case(lambda: after(arming, 0.01,
+        is_failsafe=True), {"armed": True, **RADIO_FAILSAFE}, RELEASING, RELEASE,
+        why=Code.FAILSAFE),
     "failsafe on the ground": Case(arming, {"is_failsafe": True}, PREPARING, IDLE),
     "failsafe": Case(armed, RADIO_FAILSAFE, RELEASING, RELEASE, why=Code.FAILSAFE),
     "failsafe that keeps the mode": Case(armed, KEPT, LEAVING, NEUTRAL, "RTL", Code.FAILSAFE),
@@ -259,9 +272,9 @@ CASES = {
         why=Code.NOT_READY),
     "not late yet": Case(lambda: after(arming, 89.9), {}, PREPARING, IDLE),
     "late, armed": Case(lambda: after(armed, 89.9), {}, LEAVING, NEUTRAL, "RTL", Code.NO_IMAGE),
-    "late for a climb": Case(lambda: after(partial(arming, takeoff_m=100.0), 189.91), {}, RELEASING,
+    "late for a climb": Case(lambda: after(partial(arming, takeoff_m=10.0), 99.91), {}, RELEASING,
         RELEASE, why=Code.NOT_READY),
-    "not late for a climb yet": Case(lambda: after(partial(arming, takeoff_m=100.0), 189.9), {},
+    "not late for a climb yet": Case(lambda: after(partial(arming, takeoff_m=10.0), 99.9), {},
         PREPARING, IDLE, "GUIDED"),
     "late, and the switch is not seen": Case(lambda: after(partial(arming, engage_channel=7), 89.91,
         **NO_CHANNELS), {}, RELEASING, RELEASE, why=Code.ENGAGE_SWITCH_UNSEEN),
@@ -272,6 +285,15 @@ CASES = {
     "no chunk since the reset": Case(lambda: after(lambda: after(waiting, 0.01, act="engage",
         is_policy_reset=False, is_released=True), 3.0, act=None), {}, RELEASED, why=Code.NO_CHUNK,
         refusal=Code.NO_CHUNK),
+    "no fresh chunk after the reset": Case(lambda: after(waiting, 0.01, act="engage",
+        is_policy_reset=False), {"is_policy_reset": True, "chunk_problem": NO_IMAGE}, PREPARING,
+        why=Code.FIRST_CHUNK),
+    "too slow since the reset": Case(lambda: after(waiting, 0.01, act="engage",
+        is_policy_reset=False), {"act": None, "slowness": because(Code.TOO_SLOW)}, RELEASING,
+        RELEASE, why=Code.TOO_SLOW, refusal=Code.TOO_SLOW),
+    "no image since the reset": Case(lambda: after(lambda: after(waiting, 0.01, act="engage",
+        is_policy_reset=False), 3.0, act=None), {"chunk_problem": NO_IMAGE}, RELEASING, RELEASE,
+        why=Code.NO_IMAGE, refusal=Code.NO_IMAGE),
     "ready": Case(armed, {"chunk_problem": None}, FLYING, POLICY),
     "ready in our OFFBOARD": Case(entering, {"chunk_problem": None}, FLYING, POLICY),
     # FLYING
@@ -291,6 +313,10 @@ CASES = {
     },
     "takeover: switch low": Case(partial(flying, engage_channel=7), {**SWITCH_LOW, "armed": False},
         RELEASING, RELEASE, why=Code.ENGAGE_SWITCH_OFF),
+    "takeover: a mode that was asked for before": Case(lambda: after(lambda: after(lambda: after(
+        refused, 0.01, mode="LOITER"), 0.02, is_released=True, mode="ALT_HOLD"), 0.01,
+        act="engage"), {"mode": "BRAKE"}, RELEASING, RELEASE, why=Code.MODE_CHANGED,
+        refusal=Code.ENTERED_LATE),
     "setpoints, takeover that leaves the mode": Case(in_offboard, REBOOT, LEAVING, NEUTRAL,
         "AUTO.LAND", Code.REBOOTED),
     "setpoints, switch low": Case(in_offboard, SWITCH_LOW, LEAVING, NEUTRAL, "AUTO.LAND",
@@ -304,7 +330,6 @@ CASES = {
             (Code.DISARMED, {"armed": False}),
             (Code.FAILSAFE, {"is_failsafe": True}),
             (Code.OVERRULED, {"overruled": OVERRULED}),
-            (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True}),
         )
     },
     "setpoints, failsafe that keeps the mode": Case(in_guided, KEPT, LEAVING, NEUTRAL, "RTL",
@@ -313,6 +338,8 @@ CASES = {
         Code.REBOOTED),
     "setpoints, failsafe that changes it": Case(in_guided, RADIO_FAILSAFE, RELEASING, RELEASE,
         why=Code.FAILSAFE),
+    "setpoints, another mode of setpoints": Case(in_guided, {"mode": "GUIDED"}, RELEASING, RELEASE,
+        why=Code.MODE_CHANGED),
     "setpoints in a mode of sticks": Case(partial(flying, altered(OFFBOARD, mode="POSCTL"),
         **{**SETPOINTS, "modes": ("POSCTL",)}), REBOOT, RELEASING, RELEASE),
     "sticks in a mode of setpoints": Case(partial(flying, altered(AIRBORNE, mode="GUIDED"),
@@ -350,8 +377,17 @@ CASES = {
     "act while leaving": Case(leaving, ACT, LEAVING, NEUTRAL, refusal=Code.STILL_ENDING),
     "key while leaving": Case(leaving, KEY, LEAVING, NEUTRAL, why=Code.NO_CHUNK),
     "signal while leaving": Case(leaving, {"stop": SIGNAL}, LEAVING, NEUTRAL, why=Code.NO_CHUNK),
-    "switch low while leaving": Case(partial(leaving, engage_channel=7), SWITCH_LOW, LEAVING,
-        NEUTRAL),
+    "switch low while leaving": Case(partial(leaving, IDLE_RECEIVER, engage_channel=7), SWITCH_LOW,
+        LEAVING, NEUTRAL),
+    "switch low while leaving, PX4": Case(partial(leaving, HAND, engage_channel=7), SWITCH_LOW,
+        RELEASING, RELEASE, why=Code.ENGAGE_SWITCH_OFF),
+    "switch low while leaving, PX4 without a hand": Case(partial(leaving, altered(HAND,
+        modes=PX4_MODES), engage_channel=7), SWITCH_LOW, LEAVING, NEUTRAL, "AUTO.RTL"),
+    "switch low while leaving by setpoints": Case(partial(leaving, altered(HAND, mode="OFFBOARD"),
+        engage_channel=7, is_setpoint=True, modes=("OFFBOARD",)), SWITCH_LOW, LEAVING, NEUTRAL),
+    "switch low before leaving, PX4": Case(lambda: after(lambda: after(partial(Stepped, altered(
+        HAND, armed=False, **SWITCH_LOW), arm=True, engage_channel=7), 0.02), 0.01, act="release",
+        armed=True), {}, LEAVING, NEUTRAL),
     "takeover while leaving": Case(leaving, {"mode": "LOITER"}, RELEASING, RELEASE,
         why=Code.MODE_CHANGED),
     "our mode while leaving": Case(leaving, {"mode": "RTL"}, LEAVING, NEUTRAL),
@@ -408,6 +444,8 @@ CASES = {
         "is_landed": True}, RELEASING, RELEASE, why=Code.LANDED),
     "a hand after the landing, ArduPilot": Case(holding, {"mode": "LOITER", "is_landed": True},
         RELEASING, RELEASE, why=Code.MODE_CHANGED),
+    "a hand before the landing, PX4": Case(partial(held_by_px4, "AUTO.LAND"), {"mode": "ALTCTL"},
+        RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "a hand on the ground, PX4": Case(partial(held_by_px4, "AUTO.LOITER"), {"mode": "ALTCTL",
         "is_landed": True}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
@@ -429,6 +467,8 @@ CASES = {
         refusal=Code.RELEASE_NOT_SEEN),
     "release after the way out not seen yet": Case(lambda: after(lambda: after(lambda: after(flying,
         2.0), 0.01, chunk_fault=NO_CHUNK), 0.5), {}, RELEASING, RELEASE),
+    "the pilot's BRAKE soon after ours": Case(lambda: after(lambda: after(refused, 0.01,
+        mode="BRAKE"), 0.01, mode="LOITER"), {"mode": "BRAKE"}, RELEASING, RELEASE),
     "release not seen yet": Case(lambda: after(releasing, 0.98), {}, RELEASING, RELEASE),
     "release perhaps not heard": Case(lambda: after(releasing, 3.99, shows_last=False), {},
         RELEASED, refusal=Code.RELEASE_NOT_SEEN),
@@ -442,7 +482,9 @@ CASES = {
 def take(case: Case) -> tuple[Stepped, Actions]:
     stepped = case.start()
     stepped.engagement.refusal = None
-    return stepped, stepped.step(**case.changes)
+    before, actions = stepped.phase, stepped.step(**case.changes)
+    assert before not in (PREPARING, FLYING) or Code.THEN not in stepped.codes, "at once"
+    return stepped, actions
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -456,6 +498,27 @@ def test_rows(name: str) -> None:
         () if case.refusal is None else (case.refusal,)
     )
     assert (stepped.engagement.reason is None) == (case.phase is FLYING)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("act while leaving", because(Code.STILL_ENDING, phase="leaving")),
+        ("act refused: failsafe", because(Code.FAILSAFE, mode="ALT_HOLD")),
+        ("no chunk since the reset", because(Code.NO_CHUNK_SINCE_RESET, why=NO_CHUNK)),
+        ("late for an act", because(Code.NOT_READY, after_s=3, **IN_LOITER, inputs="fine")),
+        ("our mode comes after the release", because(Code.ENTERED_LATE, mode="ALT_HOLD")),
+        ("takeover: failsafe", because(Code.FAILSAFE, mode="RTL")),
+        ("takeover: switch low", because(Code.ENGAGE_SWITCH_OFF, channel=7)),
+        ("takeover: mode_changed", because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")),
+        ("switch not seen for longer", because(Code.ENGAGE_SWITCH_UNSEEN, channel=7, limit_s=1.0)),
+    ],
+)
+def test_the_figures_of_what_is_told(name: str, why: Reason) -> None:
+    engagement = take(CASES[name])[0].engagement
+    told = engagement.refusal or engagement.reason
+    assert told is not None
+    assert why in (told, dict(told.data).get("why"))
 
 
 def test_every_row_has_a_case(monkeypatch: pytest.MonkeyPatch) -> None:
