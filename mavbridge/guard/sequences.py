@@ -232,7 +232,7 @@ class DisengageSequence:
         self.ask_at_once(now.now_ns)
         self.began_ns = now.now_ns
         self.asked_ns = self.undone_ns = None
-        self.has_failed = self.is_done = False
+        self.has_failed = False
         self.is_thrust_mode = now.status.mode in now.link.modes.thrust
         self.is_silence_failsafe = (
             now.status.has_receiver is not True or now.link.modes.is_silence_failsafe
@@ -348,7 +348,7 @@ class DisengageSequence:
             self.entered_ns = now.now_ns
         is_late = now.now_ns >= self.asks_until_ns
         is_over = elapsed_ns >= NEUTRAL_NS if is_confirmed else is_late
-        self.is_done = not is_undone and (self.is_done or is_over)
+        self.is_done = is_over and not is_undone
         # In thrust modes neutral would climb or fall, so the mode change comes first. Even after
         # it, the vehicle may take our jump to neutral for a hand.
         is_entered = bool(self.mode) and is_confirmed and not now.link.modes.override

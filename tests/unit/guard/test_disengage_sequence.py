@@ -15,12 +15,14 @@ from helpers.guard_facts import (
     PX4_MODES,
     Stepped,
     altered,
+    engagement_settings,
     flying,
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.core.vehicle import ModeRoles
+from mavbridge.guard.sequences import DisengageSequence
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
 IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
@@ -64,7 +66,10 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
         (altered(MIDDLE, is_receiver_sick=True), {"on_fault": "release"}, "BRAKE"),
         (altered(MIDDLE, rc_channels_us=()), {"on_fault": "release"}, "BRAKE"),
         (altered(MIDDLE, rc_channels_us=(0,) * 8), {"on_fault": "auto"}, "BRAKE"),
-        (altered(MIDDLE, rc_channels_us=(), heard_ns=-NS_PER_S), {"on_fault": "auto"}, None),
+        (altered(MIDDLE, rc_channels_us=(0, 1500)), {"on_fault": "auto"}, None),
+        # at 30 ms
+        (altered(MIDDLE, rc_channels_us=(), heard_ns=-220_000_000), {"on_fault": "auto"}, "BRAKE"),
+        (altered(MIDDLE, rc_channels_us=(), heard_ns=-220_000_001), {"on_fault": "auto"}, None),
         (altered(AIRBORNE, pilot_sticks=None), {"on_fault": "auto"}, "BRAKE"),
         (altered(IDLE_RECEIVER, is_landed=True), {"on_fault": "auto"}, None),
         (altered(IDLE_RECEIVER, is_landed=None), {"on_fault": "auto"}, "BRAKE"),
@@ -107,6 +112,7 @@ def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest
     facts: Any, choice: Any, mode: str
 ) -> None:
     stepped = flying(facts, on_fault=choice)
+    stepped.run(0.5)
     moves = [stepped.step(**FAULT)]  # at rest, but neutral has not left yet
     moves += [stepped.step(**FAULT, are_sticks_at_rest=False) for _ in range(40)]
     assert {(move.control, move.mode) for move in moves} == {(NEUTRAL, None)}
@@ -157,6 +163,41 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(
     assert [move.control for move in moves].index(RELEASE) == waits
 
 
+SINCE, WORD = {"undone_ns": NS_PER_S}, 100 * NS_PER_MS
+
+
+@pytest.mark.parametrize(
+    ("fields", "changes", "is_undone", "undone_ns"),
+    [
+        ({}, {}, True, NS_PER_S + 1),
+        ({"mode": None}, {}, False, None),
+        ({"asked_ns": None}, {}, False, None),
+        ({}, {"mode": "ALTCTL"}, False, None),
+        ({}, {"echo_confirmed": False}, False, None),
+        ({}, {"is_overruled": True}, False, None),
+        ({}, {"now_ns": 2 * NS_PER_S}, True, 2 * NS_PER_S),
+        ({}, {"now_ns": 2 * NS_PER_S + 1}, False, 2 * NS_PER_S + 1),
+        (SINCE, {"now_ns": NS_PER_S + WORD}, True, NS_PER_S),
+        (SINCE, {"now_ns": NS_PER_S + WORD + 1}, False, NS_PER_S),
+        (SINCE, {"now_ns": NS_PER_S + WORD + 1, "stick_override_ns": NS_PER_S}, True, NS_PER_S),
+        (SINCE, {"now_ns": NS_PER_S + WORD + 1, "stick_override_ns": 1}, False, NS_PER_S),
+        (SINCE, {"mode": "AUTO.LOITER"}, False, None),
+    ],
+)
+def test_when_our_sticks_have_ended_the_safe_mode(
+    fields: Any, changes: Any, is_undone: bool, undone_ns: int | None
+) -> None:
+    asked = {"mode": "AUTO.LOITER", "asked_ns": NS_PER_S, "entered_ns": NS_PER_S}
+    asked["request_due_ns"] = 3 * NS_PER_S
+    sequence = DisengageSequence(engagement_settings(), **asked | fields)
+    now = altered(PX4, **{"mode": "POSCTL", "now_ns": NS_PER_S + 1, **changes})
+    assert sequence.is_undone(now) is is_undone
+    sequence.step(now, None)
+    assert (sequence.undone_ns, sequence.is_done) == (undone_ns, not is_undone)
+    is_entered = sequence.asked_ns is not None and sequence.mode in (None, now.status.mode)
+    assert (sequence.entered_ns == now.now_ns) is is_entered
+
+
 def test_a_refused_mode_becomes_land() -> None:
     stepped = at_fault(IDLE_RECEIVER)
     moves = stepped.run(0.2, refused_mode="BRAKE")
@@ -164,8 +205,11 @@ def test_a_refused_mode_becomes_land() -> None:
     assert stepped.step(mode="LAND", refused_mode=None).control is RELEASE
     late = at_fault(NO_RECEIVER).run(0.3, mode="BRAKE", refused_mode="BRAKE")
     assert {move.mode for move in late} == {None}, "it has come all the same"
-    earlier = at_fault(altered(IDLE_RECEIVER, refused_mode="BRAKE")).moves[-1]
-    assert earlier.mode == "BRAKE", "an earlier flight's refusal is over"
+    sequence, refused = DisengageSequence(engagement_settings()), {"refused_mode": "BRAKE"}
+    for _ in range(2):
+        sequence.begin(altered(IDLE_RECEIVER, **refused), is_fault=True)
+        move = sequence.step(altered(IDLE_RECEIVER, **refused), None)
+        assert move.mode == "BRAKE", "an earlier flight's refusal is over"
 
 
 @pytest.mark.parametrize("hold", ["", "BRAKE"])

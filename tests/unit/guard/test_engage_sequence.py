@@ -145,6 +145,7 @@ IN_OFFBOARD = {"armed": True, "mode": "OFFBOARD", "modes": PX4_MODES}
             ["mode GUIDED"],
             Code.WAITING_FOR_MODE,
         ),
+        (PX4_GROUND, SETPOINTS, {}, IDLE, ["mode OFFBOARD"], Code.WAITING_FOR_MODE),
         (LOITERING, SETPOINTS, {}, NEUTRAL, [], Code.WAITING_FOR_MODE),
         (LOITERING, SETPOINTS, {"mode": "OFFBOARD"}, NEUTRAL, [], None),  # it is kept by them
         (altered(LOITERING, has_receiver=False), {"modes": ("AUTO.LOITER",)}, {}, None, [], None),

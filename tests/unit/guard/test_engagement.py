@@ -225,13 +225,6 @@ def test_a_key_on_the_way_in_is_the_whole_reason_and_a_later_act_has_3_s() -> No
     assert stepped.phase is Phase.RELEASED
 
 
-def test_a_wrong_mode_is_told_with_the_right_ones() -> None:
-    stepped = Stepped(altered(AIRBORNE, mode="LOITER"))
-    stepped.step("engage")
-    wrong = because(Code.WRONG_MODE, mode="LOITER", allowed="ALT_HOLD or ALTCTL")
-    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=wrong)
-
-
 def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
     stepped = Stepped(altered(ON_GROUND, chunk_problem=because(Code.NO_IMAGE)), arm=True)
     stepped.run(92, is_released=True)

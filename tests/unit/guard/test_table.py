@@ -450,6 +450,9 @@ CASES = {
         "is_landed": True}, RELEASING, RELEASE, why=Code.MODE_CHANGED),
     "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
         why=Code.DISARMED),
+    "held where a throttle at rest would end the mode, PX4": Case(lambda: after(partial(leaving,
+        altered(HAND, pilot_sticks=IDLE_RECEIVER.status.pilot_sticks)), 0.2, mode="AUTO.RTL"), {},
+        HOLDING, NEUTRAL),
     "held for long": Case(lambda: after(holding, 60.0), {}, HOLDING, NEUTRAL),
     "held, and not heard": Case(lambda: after(holding, 30.01, heard_ns=0), {}, RELEASING, RELEASE,
         why=Code.VEHICLE_LOST),
@@ -505,6 +508,10 @@ def test_rows(name: str) -> None:
     [
         ("act while leaving", because(Code.STILL_ENDING, phase="leaving")),
         ("act refused: failsafe", because(Code.FAILSAFE, mode="ALT_HOLD")),
+        (
+            "act refused: wrong_mode",
+            because(Code.WRONG_MODE, mode="LOITER", allowed="ALT_HOLD or ALTCTL"),
+        ),
         ("no chunk since the reset", because(Code.NO_CHUNK_SINCE_RESET, why=NO_CHUNK)),
         ("late for an act", because(Code.NOT_READY, after_s=3, **IN_LOITER, inputs="fine")),
         ("our mode comes after the release", because(Code.ENTERED_LATE, mode="ALT_HOLD")),
