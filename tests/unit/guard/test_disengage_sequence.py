@@ -410,7 +410,7 @@ def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
     facts: Any, blind_s: float
 ) -> None:
     stepped = at_fault(facts)
-    moves = silence(stepped, 20)
+    moves = silence(stepped, 5)
     assert stepped.phase is Phase.LEAVING, "it is not given up"
     assert {move.control for move in moves} == {NEUTRAL}
     asked = [k / 100 for k, move in enumerate(moves) if move.mode is not None]
@@ -427,6 +427,18 @@ def test_a_mode_that_was_asked_for_before_a_silence_is_ours_after_it() -> None:
     stepped.step(mode="LOITER")
     changed = because(Code.MODE_CHANGED, before="BRAKE", after="LOITER")
     assert stepped.engagement.reason == because(Code.THEN, first=FAULT["chunk_fault"], then=changed)
+
+
+@pytest.mark.parametrize(
+    ("is_failsafe", "blind_ns"), [(True, NS_PER_S // 2), (False, 3 * NS_PER_S)]
+)
+def test_the_time_for_which_a_mode_is_asked_for_unheard_includes_its_end(
+    is_failsafe: bool, blind_ns: int
+) -> None:
+    settings = engagement_settings()
+    sequence = DisengageSequence(settings, mode="BRAKE", is_silence_failsafe=is_failsafe)
+    assert sequence.step(altered(AIRBORNE, now_ns=blind_ns + 2), 1) == Actions(control=NEUTRAL)
+    assert sequence.step(altered(AIRBORNE, now_ns=blind_ns + 1), 1).mode == "BRAKE"
 
 
 @pytest.mark.parametrize(
