@@ -189,7 +189,7 @@ def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """30 s of silence from the vehicle"""
     if now.now_ns - m.heard_ns < LOST_NS:
         return None
-    return EndRequest(because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S), is_fault=True)
+    return EndRequest(because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S))
 
 
 def released(m: Memory, now: EngagementInputs) -> bool:

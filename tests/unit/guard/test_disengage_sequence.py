@@ -174,7 +174,7 @@ SINCE, WORD = {"undone_ns": NS_PER_S}, 100 * NS_PER_MS
         ({"asked_ns": None}, {}, False, None),
         ({}, {"mode": "ALTCTL"}, False, None),
         ({}, {"echo_confirmed": False}, False, None),
-        ({}, {"is_overruled": True}, False, None),
+        ({}, {"overruled": OVERRULED}, False, None),
         ({}, {"now_ns": 2 * NS_PER_S}, True, 2 * NS_PER_S),
         ({}, {"now_ns": 2 * NS_PER_S + 1}, False, 2 * NS_PER_S + 1),
         (SINCE, {"now_ns": NS_PER_S + WORD}, True, NS_PER_S),
