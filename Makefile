@@ -22,7 +22,6 @@ BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUI
 # One viewer a flight: FLAGS="--rerun connect" shows it and writes no file.
 SAVED := $(if $(findstring --rerun,$(FLAGS)),,--rerun out/flight.rrd)
 LANDED := $(if $(findstring --then,$(FLAGS)),,--then land)
-SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
@@ -32,7 +31,7 @@ FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 MODULES ?=
 ONLY ?=
 
-.PHONY: fly check test lint docs bench faults fuzz mutants soak dist clean
+.PHONY: fly check test lint docs bench faults fuzz mutants dist clean
 
 # What flies, records and trains; `installed` adds what tests, plots and computes on many machines.
 $(VENV)/flies: pyproject.toml constraints.txt
@@ -100,9 +99,6 @@ FAULTS ?=
 JOBS ?= 1
 faults: $(VENV)/installed  ## every fault with every vehicle, and docs/dev/faults.md; FAULTS="kill stop" flies those alone
 	PYTHONPATH=.:tests $(BIN)/python -m faults --jobs $(JOBS) $(or $(FAULTS),--out docs/dev/faults.md)
-
-soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
-	PYTHONPATH=.:tests $(BIN)/python -m faults --soak $(SOAK_MINUTES)
 
 FUZZ_DATAGRAMS ?= 10000000
 FUZZ_SEED ?=

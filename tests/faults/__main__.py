@@ -1,11 +1,10 @@
-"""``python -m faults``: fly the catalogue and write its page, or soak."""
+"""``python -m faults``: fly the catalogue and write its page."""
 
 import argparse
 import os
 import platform
 import signal
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
@@ -14,7 +13,6 @@ from pathlib import Path
 from faults.processes import StageError
 from faults.run import fly_scenario
 from faults.scenario import Scenario, load_catalogue
-from faults.soak import make_summary, soak
 from faults.verdict import MOST_IMPACT_MPS, MOST_LOST_M, Verdict
 from sitl import UsageError
 
@@ -52,31 +50,22 @@ MUST = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Fly or soak. Exit status 0: all passed, 1: failures, 2: a usage error."""
+    """Fly the catalogue. Exit status 0: all passed, 1: failures, 2: a usage error."""
     parser = argparse.ArgumentParser(prog="python -m faults", description=__doc__)
     add = parser.add_argument
     add("names", nargs="*", metavar="NAME", help="scenarios or groups (default: all)")
     add("--jobs", type=int, default=1, metavar="N", help="flights at once (default: 1)")
     add("--out", type=Path, metavar="FILE", help="write the page of results, in Markdown")
-    soak_help = "instead, fly for N minutes with a random fault every few seconds; find leaks"
-    add("--soak", type=float, metavar="N", help=soak_help)
     args = parser.parse_args(argv)
     # An exit by this signal also ends the processes of the current flight.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     # A shell starts programs in the background without Ctrl-C, and the bridge would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return _soak(args.soak) if args.soak else _fly_catalogue(args)
+        return _fly_catalogue(args)
     except (UsageError, StageError) as error:
         print(f"faults: error: {error}", file=sys.stderr)
         return 2
-
-
-def _soak(minutes: float) -> int:
-    with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        result = soak(minutes, Path(folder), print)
-    print(make_summary(result))
-    return 1 if result.failures else 0
 
 
 def _fly_catalogue(args: argparse.Namespace) -> int:

@@ -39,18 +39,14 @@ class Process:
         return at_ns
 
     def peak_memory_mb(self) -> float:
-        return int(status_of(self.pid)["VmHWM"].split()[0]) / 1024
+        lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
+        (peak,) = [line for line in lines if line.startswith("VmHWM:")]
+        return int(peak.split()[1]) / 1024
 
     def close(self) -> None:
         """Kill it if it still runs."""
         self.kill(signal.SIGKILL)
         os.close(self._fd)
-
-
-def status_of(pid: int) -> dict[str, str]:
-    """Parse /proc/PID/status."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return dict(line.split(":", 1) for line in lines if ":" in line)
 
 
 def processes_with(variable: str) -> list[tuple[int, str]]:

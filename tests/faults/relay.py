@@ -182,13 +182,11 @@ class Relay(Worker):
         """All overrides so far, releases included."""
         return [sticks for sent in self.sent if (sticks := sent.override) is not None]
 
-    def forget(self) -> int:
-        """Forget the flight so far, because another begins. Return the number of its overrides."""
+    def forget(self) -> None:
+        """Forget the flight so far, because another begins."""
         with self._news:
-            count = len(self.overrides)
             self.sent.clear()
             self.has_flown.clear()
-            return count
 
     def newest_steering(self, rows: int) -> list[Sent]:
         """Return up to ``rows`` of the newest messages of sticks, newest last."""
@@ -211,11 +209,6 @@ class Relay(Worker):
     def rewrite(self, change: Rewrite) -> int:
         """Also pass every message of the vehicle through ``change``; return the time."""
         self._rewrites = (*self._rewrites, change)
-        return self._clock.now_ns()
-
-    def rewrite_nothing(self) -> int:
-        """Pass the vehicle's messages unchanged again; return the time."""
-        self._rewrites = ()
         return self._clock.now_ns()
 
     def inject(self, message: Message, station: Message = None) -> int:

@@ -107,7 +107,7 @@ def images(stage: Stage, *, show: str) -> int:
 def messages(
     stage: Stage, *, names: Sequence[str], do_with: str = "drop", field: str = "", value: float = 0
 ) -> int:
-    """Drop, freeze, set or offset a field (or all measurements) of the vehicle's messages."""
+    """Drop, freeze or set a field (or all measurements) of the vehicle's messages."""
     frozen: dict[str, float] = {}
 
     def change(message: Message) -> bool:
@@ -116,11 +116,10 @@ def messages(
         if do_with == "drop":
             return False
         for name in [field] if field else _measured(message):
-            now = getattr(message, name)
             if do_with == "freeze":
-                set_fields(message, **{name: frozen.setdefault(name, now)})
+                set_fields(message, **{name: frozen.setdefault(name, getattr(message, name))})
             else:
-                set_fields(message, **{name: value + (now if do_with == "add" else 0)})
+                set_fields(message, **{name: value})
         return True
 
     return stage.relay.rewrite(change)
@@ -130,11 +129,6 @@ def _measured(message: Message) -> list[str]:
     """Return the names of numeric fields other than times."""
     names = [n for n in message.get_fieldnames() if isinstance(getattr(message, n), int | float)]
     return [name for name in names if not name.startswith("time")]
-
-
-def whole_messages(stage: Stage) -> int:
-    """Pass every message of the vehicle unchanged again."""
-    return stage.relay.rewrite_nothing()
 
 
 def clock(stage: Stage, *, s: float) -> int:
@@ -276,7 +270,7 @@ KINDS = {
     function.__name__.replace("_", " "): function
     for function in (
         *(wait, policy, ended, signal, terminal, limit, wall_clock, load, viewer, images, messages),
-        *(whole_messages, clock, pilot, joystick, param, switch, radio, link, silence, broken),
+        *(clock, pilot, joystick, param, switch, radio, link, silence, broken),
         *(unread, duplicate_system, rates),
     )
 }

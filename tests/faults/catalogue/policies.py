@@ -84,20 +84,6 @@ class Leaning(Climbing):
         return self._flown == self.fault_calls + 1
 
 
-class Wandering(Leaning):
-    """Climbs for two seconds, then leans left and right in turn for ever, at constant height."""
-
-    climb_calls, turn_calls = 200, 400
-
-    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
-        chunk = Climbing.predict_fast(self, feature, state, history, steps)
-        if self._flown is not None and self._flown >= 0:
-            self._flown += 1
-            side = 1.0 if self._flown // self.turn_calls % 2 else -1.0
-            chunk[:] = (0.5 if self._flown < self.climb_calls else 0.0, 0.2, 0.0, 0.4 * side)
-        return chunk
-
-
 class Deliberate(Leaning):
     """Makes two chunks per second, each in 0.3 s, and plays each for one second."""
 
