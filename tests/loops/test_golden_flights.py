@@ -4,15 +4,19 @@ If one of these tests fails, the flight or the guard now does something else wit
 features and moments. Where that is meant, record the flight anew (tests/data/flights/README.md).
 """
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, NAMES, golden, through_gate
-from mavbridge.commands.replay import CLOCK_TOLERANCE, ENGINE_TOLERANCE
+from mavbridge.commands.config import ReplayConfig
+from mavbridge.commands.replay import CLOCK_TOLERANCE, ENGINE_TOLERANCE, replay
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import ExitCode
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
 from mavbridge.flight.action_frames import ActionFrame
@@ -34,6 +38,8 @@ from mavbridge.simulation.replay.policy import replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource
 from policy.protocol import PolicyRunner
 
+NUMPY = f"{FLIGHTS / 'numpy_policy.py'}:NumpyPolicy"
+
 
 def stepped_clock(source: ReplaySource) -> SteppedClock:
     return SteppedClock(source.solves[0].started_ns - NS_PER_S)
@@ -48,8 +54,7 @@ def test_a_recording_names_no_path_of_the_machine_that_made_it() -> None:
 def numpy_runner() -> Iterator[PolicyRunner]:
     """The policy as a flight loads it."""
     source = golden("numpy_px4")
-    spec = f"{FLIGHTS / 'numpy_policy.py'}:NumpyPolicy"
-    wanted = replace(source.config.policy, policy=spec)
+    wanted = replace(source.config.policy, policy=NUMPY)
     with load_configured_policy(wanted, stepped_clock(source)) as loaded:
         yield loaded.runner
 
@@ -79,54 +84,26 @@ def repeated(source: ReplaySource, runner: PolicyRunner) -> PolicyComparison:
     return compare_policy(replay_policy(source, runner, clock, source.features))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_guard_reproduces_phases_traces_and_sent_sticks_bit_for_bit(name: str) -> None:
-    compared = compare_guard(through_gate(name))
-
-    assert compared.first is None
-    assert compared.differ == {}
-    assert compared.flown > 100
-    assert golden(name).gaps == ()
-
-
-def test_the_policy_loop_reproduces_every_input_and_chunk_bit_for_bit(
-    numpy_runner: PolicyRunner,
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [
+        ("numpy_px4", ReplayConfig(policy=NUMPY, source="features", tolerance=0.0)),
+        # Bits of its chunks depend on the processor.
+        ("toge_ardupilot", ReplayConfig(tolerance=ENGINE_TOLERANCE)),
+        # It looks at the clock, which differs by some 0.1 ms.
+        ("scripted_velocity_ardupilot", ReplayConfig(tolerance=CLOCK_TOLERANCE)),
+    ],
+)
+def test_guard_and_policy_do_again_what_they_did(
+    name: str, config: ReplayConfig, tmp_path: Path
 ) -> None:
-    compared = repeated(golden("numpy_px4"), numpy_runner)
-
-    assert compared.missing == {}
-    assert compared.inputs_differ == {}
-    assert compared.equal_chunks == compared.solves > 400
-
-
-def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_engine() -> None:
-    """Bits of its chunks depend on the processor, so that they have a tolerance here."""
-    source = golden("toge_ardupilot")
-    clock = stepped_clock(source)
-    with load_configured_policy(source.config.policy, clock) as loaded:
-        pairs = list(replay_policy(source, loaded.runner, clock, source.features))
-    compared = compare_policy(pairs)
-
-    assert compared.missing == {}
-    assert compared.inputs_differ == {}
-    chunks = {
-        pair.recorded.serial: chunk_of(pair.replayed, ActionFrame(source.contract))
-        for pair in pairs
-        if pair.replayed is not None
-    }
-    steps = through_gate("toge_ardupilot")
-    outputs = replay_other(steps, recorded_plan(source).guard, chunks)
-    assert stick_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
-
-
-def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
-    source = golden("scripted_velocity_ardupilot")
-    clock = stepped_clock(source)
-    with load_configured_policy(source.config.policy, clock, starts_in_air=True) as loaded:
-        compared = compare_policy(replay_policy(source, loaded.runner, clock, source.features))
-
-    assert compared.inputs_differ == {}
-    assert compared.deviation.most < CLOCK_TOLERANCE
+    written = tmp_path / "replay.json"
+    assert replay(FLIGHTS / name, replace(config, json=written)) == ExitCode.DONE
+    told = json.loads(written.read_text())
+    assert (told["gaps"], told["guard"]["differ"]) == ([], {})
+    assert told["guard"]["flown"] > 100
+    assert told["policy"]["solves"] > 100
+    assert (told["policy"]["missing"], told["policy"]["inputs_differ"]) == ({}, {})
 
 
 @pytest.mark.parametrize("name", NAMES)

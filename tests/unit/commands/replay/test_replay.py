@@ -19,31 +19,14 @@ from mavbridge.commands.replay import (
 )
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.chunks import late
 from mavbridge.recording.folder import SETTINGS
-from mavbridge.simulation.replay.guard import _absences
 from mavbridge.simulation.replay.recording import open_source
 
 NUMPY = FLIGHTS / "numpy_px4"
 B = Path("b.pt")
 FLOWN = FlyConfig(policy=PolicyConfig(checkpoint=B, seed=3))
-
-
-def test_the_recorded_chunks_through_the_guard_are_equal_bit_for_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    written = tmp_path / "replay.json"
-
-    assert replay(NUMPY, ReplayConfig(source="chunks", json=written)) == 0
-
-    assert "EQUAL, bit for bit" in capsys.readouterr().out
-    document = json.loads(written.read_text())
-    assert document["is_equal"] is True
-    assert document["guard"]["differ"] == {}
-    assert document["policy"] is None
 
 
 def test_a_guard_that_smooths_differently_is_found_out(
@@ -145,23 +128,6 @@ def test_of_a_flight_that_was_cut_off_the_ticks_of_lost_chunks_are_left_out(
     assert source.ticks[-1].chunk_serial == flown[-10].chunk_serial
     assert re.search(r"the chunks of its last \d\d+ ticks are not recorded", *source.gaps)
     assert "EQUAL, bit for bit" in capsys.readouterr().out
-
-
-def test_an_end_between_two_slots_was_caused_by_a_message_about_the_missing_chunk() -> None:
-    """Without it the replayed guard sleeps until the next slot, and ends the flight late."""
-    source = golden("numpy_px4")
-    too_old = because(Code.TOO_OLD, quantity="image", age_ms=396.0, limit_ms=300.0)
-    reason = late("image", 403 * NS_PER_MS, 300 * NS_PER_MS, "camera", 396 * NS_PER_MS, too_old)
-    end = next(tick for tick in source.ticks if tick.phase == "leaving")
-    before = next(tick for tick in reversed(source.ticks) if tick.phase == "flying")
-    told = {}
-    for is_slot in (False, True):
-        ending = replace(end, release_reason=reason, is_slot=is_slot)
-        ended = replace(source, ticks=(before, ending))
-        told[is_slot] = list(_absences(ended, 10 * NS_PER_MS))
-
-    assert told[False] == [*told[True], (end.decided_ns, too_old)]
-    assert len(told[True]) == 1
 
 
 def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
