@@ -8,21 +8,19 @@ record and the sent bytes.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
-import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import ListSink
 from helpers.guard_facts import codes
-from helpers.guard_world import Direction, FlightPort, FreshFeatures, Network
+from helpers.guard_world import FlightPort, FreshFeatures, LinkedVehicle
 from helpers.wire import WireEnd
-from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Solve
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.settings import link_settings
@@ -31,85 +29,22 @@ from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.connection import Address, Received
-from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.clock import AheadClock
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process
 from mavbridge.simulation.network import DelayedChannel
-from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
-from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
-from sitl.ardupilot.autopilot import ArduCopter
-from sitl.ardupilot.flight_modes import Mode
-from sitl.course import AirborneStart
-from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import MID_RECEIVER_US, VehicleConfig
+from sitl.vehicle.config import VehicleConfig
 
 MS = NS_PER_MS
-ALOFT = AirborneStart(
-    position_ned_m=(0.0, 0.0, -10.0),
-    velocity_ned_mps=(0.0, 0.0, 0.0),
-    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-    next_gate=0,
-)
-HOVER = (0.0, 0.0, 0.0, 0.0)
-CONTRACT = Contract(feature_dim=1, arrays="numpy")
-Policy = Callable[[float], tuple[float, float, float, float]]
-"""Seconds since the first flight began (negative before it) -> throttle, yaw, pitch, roll."""
 
 
-def hovering(_: float) -> tuple[float, float, float, float]:
-    return HOVER
-
-
-def leaning(_: float) -> tuple[float, float, float, float]:
-    """Return sticks far enough from neutral, and any receiver, to be told apart in records."""
-    return (0.0, 0.1, 0.2, 0.3)
-
-
-def climbing_first(t_s: float) -> tuple[float, float, float, float]:
-    """Climb from the ground to some 4 m, then hover with a lean."""
-    return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
-
-
-class GuardFlight:
+class GuardFlight(LinkedVehicle):
     """One flight of one vehicle. Nothing happens until ``run`` or ``until`` is called."""
 
-    def __init__(
-        self,
-        policy: Policy = leaning,
-        *,
-        receiver_us: tuple[int, ...] | None = MID_RECEIVER_US,
-        params: dict[str, float] | None = None,
-        contract: Contract = CONTRACT,
-        link: dict[str, Any] | None = None,
-        vehicle: VehicleConfig = NOMINAL_VEHICLE,
-        **config: Any,
-    ) -> None:
-        """``config`` are fields of ``FlyConfig``, ``link`` those of ``LinkConfig``."""
-        self.clock = SteppedClock()
-        self.policy = policy
-        self.solve_ns = 3 * MS
-        self._engaged_ns: int | None = None
+    def __init__(self, vehicle: VehicleConfig, params: dict[str, float], config: FlyConfig) -> None:
+        super().__init__(vehicle, params)
         self.is_flight_process_stopped = False
         """True if it neither receives nor sends, as under SIGSTOP."""
-        self.vehicle = SimulatedVehicle(
-            links=2,
-            boot_ns=self.clock.now_ns(),
-            config=replace(vehicle, receiver_us=receiver_us),
-        )
-        for name, value in (params or {}).items():
-            assert self.vehicle.params.set(name, value), name
-        self.up, self.down = Direction(self.clock), Direction(self.clock)
-        self.network = Network(self.clock, self.up, self.down)
-        self._compose(
-            FlyConfig(link=LinkConfig(connect="memory", **(link or {})), **config),
-            contract,
-        )
-        ends = {"to_vehicle": self.up, "from_vehicle": self.down}
-        stepper = VehicleStepper(self.clock, self.vehicle, self.clock.now_ns(), **ends)
-        stepper.watchers.append(self._after_step)
-
-    def _compose(self, config: FlyConfig, contract: Contract) -> None:
         hop_ns = iter(lambda: NS_PER_MS // 10, None)
         to_guard = DelayedChannel(self.clock, hop_ns)
         to_flight = DelayedChannel(self.clock, hop_ns)
@@ -121,9 +56,8 @@ class GuardFlight:
         self.features = FreshFeatures(self.clock)
         self.sink = ListSink()
         self.solves: list[Solve] = []
-        runner = self._runner(contract)
-        self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
+        runner = self._runner()
         plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
         self.view = TelemetryCache(plan, sink=self.sink)
         policy = PolicyLoop(
@@ -144,21 +78,9 @@ class GuardFlight:
 
     # --- the flight process
 
-    def _runner(self, contract: Contract) -> PolicyRunner:
-        return PolicyRunner(
-            contract=contract,
-            name="test",
-            engine="numpy",
-            dual_rate=True,
-            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-            act=self._act,
-        )
-
-    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        self._policy_clock.ahead_ns += self.solve_ns
-        chunk = np.empty((1, self._horizon, 4), np.float32)
-        chunk[:] = self.policy(self.flown_s)
-        return chunk
+    def _runner(self) -> PolicyRunner:
+        """Return the policy, whose calls take time of ``_policy_clock``."""
+        raise NotImplementedError
 
     def _send(self, message: ToGuard) -> None:
         data = encode_to_guard(message)
@@ -193,10 +115,6 @@ class GuardFlight:
 
     # --- time
 
-    def _after_step(self) -> None:
-        """Called after each step of the vehicle; other stations read nothing."""
-        self.vehicle.take_outgoing(1)
-
     def run(self, seconds: float) -> None:
         self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * NS_PER_S))
 
@@ -211,66 +129,17 @@ class GuardFlight:
 
     def describe(self) -> str:
         """Return the state of both ends, for a failed test."""
-        ap = self.vehicle.ap
+        ap, told = self.vehicle.ap, [r for r in self.guard_port.reports if isinstance(r, str)]
         return (
             f"{self.phase} ({self.reason}); {ap.mode_name}, armed {ap.armed}, "
-            f"height {self.height_m:.1f} m, {self.messages}"
+            f"height {self.height_m:.1f} m, {told}"
         )
 
     @property
     def summary(self) -> dict[str, Any]:
         return self.vehicle.log.summary(self.vehicle.ap)
 
-    @property
-    def t_s(self) -> float:
-        """Seconds since boot: the time of the vehicle's records."""
-        return self.summary["duration_s"]
-
-    @property
-    def flown_s(self) -> float:
-        """Seconds since the policy first flew; negative before."""
-        ticks = (r for r in self.guard_port.reports if isinstance(r, GuardTick))
-        if self._engaged_ns is None:
-            self._engaged_ns = next((t.sent_ns for t in ticks if t.phase is Phase.FLYING), None)
-        if self._engaged_ns is None:
-            return -1.0
-        return (self.clock.now_ns() - self._engaged_ns) / NS_PER_S
-
-    # --- ways into the air
-
-    def launch(self) -> Self:
-        """Hover armed under the pilot, with the link ready and the policy fresh."""
-        self.vehicle.launch(ALOFT)
-        self.ap.set_mode(Mode.ALT_HOLD)
-        self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=8)
-        return self
-
-    def fly(self, seconds: float = 1.5) -> Self:
-        """Launch, engage by the key, and let the policy fly long enough for the echo."""
-        self.launch()
-        self.act("engage")
-        self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
-        self._begin_program()
-        self.run(seconds)
-        assert self.phase is Phase.FLYING, self.describe()
-        return self
-
-    def _begin_program(self) -> None:
-        """Called when the policy has the sticks."""
-
-    def take_off(self, seconds: float = 4.0) -> Self:
-        """Engage with --arm on the ground, and climb; also for a vehicle without a receiver."""
-        self.until(lambda: self.phase is Phase.FLYING, within_s=12)
-        self.run(seconds)
-        assert self.phase is Phase.FLYING, self.describe()
-        assert self.height_m > 2, self.describe()
-        return self
-
     # --- what happened
-
-    @property
-    def ap(self) -> ArduCopter:
-        return self.vehicle.ap
 
     @property
     def height_m(self) -> float:
@@ -281,34 +150,21 @@ class GuardFlight:
         return [r for r in self.guard_port.reports if isinstance(r, GuardTick)]
 
     @property
-    def last(self) -> GuardTick | None:
-        return next(
-            (r for r in reversed(self.guard_port.reports) if isinstance(r, GuardTick)), None
-        )
+    def _last(self) -> GuardTick | None:
+        reports = reversed(self.guard_port.reports)
+        return next((each for each in reports if isinstance(each, GuardTick)), None)
 
     @property
     def phase(self) -> Phase:
-        return self.last.phase if self.last else Phase.WAITING
+        return self._last.phase if self._last else Phase.WAITING
 
     @property
     def reason(self) -> Reason | None:
-        return self.last.release_reason if self.last else None
+        return self._last.release_reason if self._last else None
 
     @property
     def codes(self) -> tuple[Code, ...]:
         return codes(self.reason)
-
-    @property
-    def messages(self) -> list[str]:
-        return [r for r in self.guard_port.reports if isinstance(r, str)]
-
-    def phases(self, since_ns: int = 0) -> list[Phase]:
-        """Phases in order, without repeats."""
-        found: list[Phase] = []
-        for tick in self.ticks:
-            if tick.sent_ns >= since_ns and (not found or found[-1] is not tick.phase):
-                found.append(tick.phase)
-        return found
 
     def left(self, since_ns: int = 0) -> list[tuple[int, Any]]:
         """MAVLink messages that left the guard, with their times, including lost ones."""
@@ -323,32 +179,7 @@ class GuardFlight:
             if m.get_type() == "COMMAND_LONG" and m.command == dialect.MAV_CMD_DO_SET_MODE
         ]
 
-    def sticks_sent(self, since_ns: int = 0) -> list[tuple[int, Sticks]]:
-        """Sent overrides as sticks, without releases."""
-        return [
-            (t.sent_ns, t.sent) for t in self.ticks if t.sent is not None and t.sent_ns >= since_ns
-        ]
-
-    def overrides(self, since_ns: int = 0) -> list[tuple[int, tuple[int, ...]]]:
-        """First four channels of each sent RC_CHANNELS_OVERRIDE [us]."""
-        return [
-            (at_ns, (m.chan1_raw, m.chan2_raw, m.chan3_raw, m.chan4_raw))
-            for at_ns, m in self.left(since_ns)
-            if m.get_type() == "RC_CHANNELS_OVERRIDE"
-        ]
-
-    def record(self, since_s: float = 0.0) -> list[dict[str, Any]]:
-        """The vehicle's own record of its sticks, by time since boot."""
-        return [entry for entry in self.summary["sticks"] if entry["t_s"] >= since_s]
-
-    @property
-    def modes(self) -> list[str]:
-        return [entry["mode"] for entry in self.summary["modes"]]
-
     # --- others
-
-    def pilot_mode(self, number: int) -> None:
-        self.command(dialect.MAV_CMD_DO_SET_MODE, 1, number)
 
     def command(self, number: int, *params: float) -> None:
         """Send a COMMAND_LONG of another station."""
@@ -361,25 +192,3 @@ class GuardFlight:
         """Send a message of another station over a separate link."""
         end = WireEnd(system=system, component=190)
         self.vehicle.receive(1, end.pack(encode(end.mav)), self.clock.now_ns())
-
-    def joystick(self, rate_hz: float, us: tuple[int, int, int, int]) -> None:
-        """Override the same channels from now on with a joystick that uses our system id."""
-
-        def send() -> None:
-            self.station(lambda mav: mav.rc_channels_override_encode(1, 1, *us, 0, 0, 0, 0))
-            self.clock.schedule(self.clock.now_ns() + round(NS_PER_S / rate_hz), send)
-
-        # Halfway between two of our sends: just before one it would never be shown.
-        self.clock.schedule(self.clock.now_ns() + 13 * MS // 2, send)
-
-    def receiver(self, **channels_us: int) -> None:
-        """Move sticks and switches of the transmitter: ch3=1500."""
-        values = [0] * 8
-        for name, value_us in channels_us.items():
-            values[int(name.removeprefix("ch")) - 1] = value_us
-        self.vehicle.set_receiver(values)
-
-    def inject(self, data: bytes, sender: Address) -> None:
-        """Send bytes to the guard from another address."""
-        self.network.strangers.append(Received(data, self.clock.now_ns(), sender))
-        self._wake()

@@ -13,6 +13,9 @@ from mavbridge.mavlink.transport.connection import Address, Received, TransportD
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.guard import MemoryPort
 from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
+from mavbridge.simulation.world import VehicleStepper
+from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import VehicleConfig
 
 MS = NS_PER_MS
 DELAY_NS = NS_PER_MS * 3 // 10
@@ -49,14 +52,12 @@ class Direction(DelayedChannel):
 
 
 class Network(MemoryTransport):
-    """The guard's end of the link, which other addresses can write to, too."""
+    """The bridge's end of the link, which other addresses can write to, too."""
 
     def __init__(self, clock: SteppedClock, to_vehicle: Direction, from_vehicle: Direction) -> None:
         self._clock = clock
         super().__init__(to_vehicle=to_vehicle, from_vehicle=from_vehicle)
         self._to_vehicle: Direction = to_vehicle
-        self.address: Address = VEHICLE
-        """Address that the vehicle sends from."""
         self.strangers: deque[Received] = deque()
         self.received: list[Received] = []
         """Everything from the vehicle, as a recording holds it."""
@@ -73,18 +74,40 @@ class Network(MemoryTransport):
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         self.open()
-        if peer is None or peer == self.address:
+        if peer in (None, VEHICLE):
             return super().send(data, peer)
-        self._to_vehicle.sent.append((self._clock.now_ns(), data))  # to its former address
+        self._to_vehicle.sent.append((self._clock.now_ns(), data))  # to a stranger
         return True
 
     def drain(self) -> Iterator[Received]:
         self.open()
         for received in super().drain():
             self.received.append(received)
-            yield received._replace(sender=self.address)
+            yield received
         while self.strangers:
             yield self.strangers.popleft()
+
+
+class LinkedVehicle:
+    """A simulated vehicle on a stepped clock, and the bridge's end of its link.
+
+    Another station has a second link, whose answers nobody reads.
+    """
+
+    def __init__(self, config: VehicleConfig, params: dict[str, float] | None = None) -> None:
+        self.clock = SteppedClock()
+        self.vehicle = SimulatedVehicle(links=2, boot_ns=self.clock.now_ns(), config=config)
+        for name, value in (params or {}).items():
+            assert self.vehicle.params.set(name, value), name
+        self.up, self.down = Direction(self.clock), Direction(self.clock)
+        self.network = Network(self.clock, self.up, self.down)
+        ends = {"to_vehicle": self.up, "from_vehicle": self.down}
+        stepper = VehicleStepper(self.clock, self.vehicle, self.clock.now_ns(), **ends)
+        stepper.watchers.append(self._after_step)
+
+    def _after_step(self) -> None:
+        """Called after each step of the vehicle."""
+        self.vehicle.take_outgoing(1)
 
 
 class FlightPort(MemoryPort):

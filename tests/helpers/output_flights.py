@@ -10,23 +10,33 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.guard_flights import ALOFT, GuardFlight
+from helpers.guard_flights import MS, GuardFlight
+from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
+from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
-from policy.contract import ActionKind, Contract, FloatArray
+from policy.contract import ActionKind, FloatArray
 from policy.motion.controllers import Motion, Program, Push, make_program
 from policy.motion.scripted import ScriptedPolicy
 from policy.protocol import PolicyRunner
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode
+from sitl.course import AirborneStart
 from sitl.px4.autopilot import Px4
 from sitl.px4.modes import Px4Mode
-from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
+from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, VehicleConfig
 from sitl.vehicle.firmware import VelocitySetpoint
 from sitl.vehicle.rotation import Quat, cos_tilt
 
+ALOFT = AirborneStart(
+    position_ned_m=(0.0, 0.0, -10.0),
+    velocity_ned_mps=(0.0, 0.0, 0.0),
+    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+    next_gate=0,
+)
+SOLVE_NS = 3 * MS
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
 """Lean 15 degrees to the right, or fly 2 m/s to the right: far from neutral in every record."""
 HOVERING = make_program("hover", "sticks")
@@ -89,40 +99,48 @@ class OutputFlight(GuardFlight):
         program: Program = LEANING,
         *,
         in_air: bool = True,
-        px4_release: Px4Release = "1.18",
+        has_receiver: bool = True,
+        params: dict[str, float] | None = None,
+        vehicle: VehicleConfig = NOMINAL_VEHICLE,
         **config: Any,
     ) -> None:
-        """``config`` as in ``GuardFlight``. ArduPilot has a receiver with centred sticks."""
+        """``config`` are fields of ``FlyConfig``. PX4 has no receiver, ArduPilot's is centred."""
         self.autopilot, self.kind, self.is_px4 = autopilot, kind, autopilot == "px4"
         self.mode = FLIGHT_MODES[autopilot, kind]
         self.samples: list[Sample] = []
         self._in_air = in_air
-        self._program = program
+        self.program = program
         self._nan_from_ns: int | None = None
-        self._boot_ns = 0
+        receiver_us = MID_RECEIVER_US if has_receiver and not self.is_px4 else None
         super().__init__(
-            receiver_us=None if self.is_px4 else MID_RECEIVER_US,
-            params=None if self.is_px4 else {"GUID_OPTIONS": 8.0},
-            vehicle=replace(NOMINAL_VEHICLE, autopilot=autopilot, px4_release=px4_release),
-            **config,
+            replace(vehicle, autopilot=autopilot, receiver_us=receiver_us),
+            ({} if self.is_px4 else {"GUID_OPTIONS": 8.0}) | (params or {}),
+            FlyConfig(link=LinkConfig(connect="memory"), **config),
         )
         self._boot_ns = self.vehicle.ap.now_ns
 
     # --- the policy
 
-    def _runner(self, contract: Contract) -> PolicyRunner:
+    def _runner(self) -> PolicyRunner:
         self.scripted = ScriptedPolicy(
             "hover",
             lambda: self.clock.now_ns() / NS_PER_S,
             action=self.kind,
             starts_in_air=self._in_air,
         )
-        self.scripted._program = self._program
-        act = super()._runner(contract)
-        return replace(act, contract=self.scripted.contract, reset=self.scripted.reset)
+        self.scripted._program = Program(motion=lambda time_s: self.program.motion(time_s))
+        return PolicyRunner(
+            contract=self.scripted.contract,
+            name="test",
+            engine="numpy",
+            dual_rate=True,
+            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+            act=self._act,
+            reset=self.scripted.reset,
+        )
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        self._policy_clock.ahead_ns += self.solve_ns
+        self._policy_clock.ahead_ns += SOLVE_NS
         chunk = self.scripted.predict_fast(encoded, state, history, 1)
         if self._nan_from_ns is not None and self.clock.now_ns() >= self._nan_from_ns:
             chunk[:, :, 1] = np.nan
@@ -139,6 +157,16 @@ class OutputFlight(GuardFlight):
         self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=10)
         return self
 
+    def fly(self, seconds: float = 1.5) -> Self:
+        """Launch, engage by the key, and let the policy fly long enough for the echo."""
+        self.launch()
+        self.act("engage")
+        self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
+        self.begin_program()
+        self.run(seconds)
+        assert self.phase is Phase.FLYING, self.describe()
+        return self
+
     def put_in_air(self) -> None:
         """Hover armed under the pilot, from any state of the vehicle."""
         self.vehicle.launch(ALOFT)
@@ -146,15 +174,15 @@ class OutputFlight(GuardFlight):
         if not self.is_px4:
             assert self.ardupilot.set_mode(ArduMode[self.mode])
         elif self.kind != "sticks":
-            self._forget_sticks()
+            self.forget_sticks()
 
-    def _forget_sticks(self) -> None:
+    def forget_sticks(self) -> None:
         """Reset PX4 to a vehicle that was armed without sticks, none of which has ever moved."""
         self.px4.set_mode(Px4Mode.AUTO_LOITER)
         self.px4.stick_input.valid = self.px4.stick_input._never_ages = False
         self.px4.start_motors(ignores_sticks=True)
 
-    def _begin_program(self) -> None:
+    def begin_program(self) -> None:
         self.run(0.05)  # the policy is reset when a flight begins
         self.scripted.program_start_s = 0.0
 

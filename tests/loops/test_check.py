@@ -2,26 +2,21 @@
 
 import math
 from dataclasses import replace
-from itertools import repeat
 from typing import Any
 
 import pytest
 
+from helpers.guard_world import LinkedVehicle
 from mavbridge.commands.check.rows import CheckRow, overall
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.flight.plan import plan_flight
 from mavbridge.mavlink.codec.messages import Body
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.connection import Address
-from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.network import DelayedChannel, MemoryTransport
-from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
+from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract
-from sitl.ardupilot.autopilot import ArduCopter
-from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, AutopilotName
 
 OVERRIDE = 70
@@ -29,7 +24,7 @@ OVERRIDE = 70
 SAFE = {"RC_OVERRIDE_TIME": 0.5, "RC8_OPTION": 46}
 
 
-class Bench:
+class Bench(LinkedVehicle):
     """A vehicle that stands on the ground, and the check's end of its link."""
 
     def __init__(
@@ -40,41 +35,9 @@ class Bench:
         position: bool = True,
         params: dict[str, float] | None = None,
     ) -> None:
-        self.clock = SteppedClock()
-        self.vehicle = SimulatedVehicle(
-            links=1,
-            boot_ns=self.clock.now_ns(),
-            config=replace(
-                NOMINAL_VEHICLE,
-                autopilot=autopilot,
-                receiver_us=receiver_us,
-                position_ready_s=NOMINAL_VEHICLE.position_ready_s if position else math.inf,
-            ),
-        )
-        for name, value in (params or {}).items():
-            assert self.vehicle.params.set(name, value), name
-        up, down = (DelayedChannel(self.clock, repeat(NS_PER_MS)) for _ in range(2))
-        self.transport = MemoryTransport(to_vehicle=up, from_vehicle=down)
-        self.stepper = VehicleStepper(
-            self.clock, self.vehicle, self.clock.now_ns(), to_vehicle=up, from_vehicle=down
-        )
-
-    def arm(self) -> None:
-        """Somebody arms it, whatever its own checks say."""
-        assert isinstance(self.vehicle.ap, ArduCopter)
-        assert self.vehicle.ap.arm(force=True)
-
-    def log_sent(self) -> list[tuple[int, bytes]]:
-        """Every packet to the vehicle from now on, with its time."""
-        sent: list[tuple[int, bytes]] = []
-        send = self.transport.send
-
-        def log(data: bytes, peer: Address | None = None) -> bool:
-            sent.append((self.clock.now_ns(), data))
-            return send(data, peer)
-
-        self.transport.send = log  # type: ignore[method-assign]
-        return sent
+        ready_s = NOMINAL_VEHICLE.position_ready_s if position else math.inf
+        changes = {"autopilot": autopilot, "receiver_us": receiver_us, "position_ready_s": ready_s}
+        super().__init__(replace(NOMINAL_VEHICLE, **changes), params)
 
     def check(self, *, contract: Contract | None = None, **link: Any) -> dict[str, CheckRow]:
         """The rows by their names."""
@@ -83,7 +46,7 @@ class Bench:
             config,
             None if contract is None else plan_flight(config, contract, is_dual=True),
             self.clock,
-            transport=self.transport,
+            transport=self.network,
         )
         return {row.name: row for row in rows}
 
@@ -161,18 +124,9 @@ def test_what_a_flight_refuses_is_a_no_go_and_its_flag_mends_it(
     if name in rows:  # a switch or channel that does no harm has no row
         assert rows[name].found == f"{value:g}; --set makes it {mended:g}"
     assert bench.vehicle.params[name] == value, "nothing was set"
-
-
-def test_without_a_receiver_its_failsafes_count() -> None:
-    bench = Bench(receiver_us=None, params=SAFE | {"FS_THR_ENABLE": 0, "FS_OPTIONS": 16})
-    rows = bench.check(contract=Contract())
-    assert rows["radio receiver"].verdict == "warn"
-    assert rows["FS_THR_ENABLE"].verdict == "no-go"
-    assert rows["FS_OPTIONS"].commands == ("--set FS_OPTIONS=24",)
-    accepted = bench.check(contract=Contract(), accept_risk=("no-throttle-failsafe",))
-    assert accepted["FS_THR_ENABLE"].verdict == "warn"
-    seen = Bench(params=SAFE | {"FS_THR_ENABLE": 0}).check(contract=Contract())
-    assert seen["radio receiver"].verdict == "go"
+    if name == "RC_OVERRIDE_TIME":
+        rows = bench.check(contract=Contract(), accept_risk=("endless-override",))
+        assert rows[name].verdict == "warn"
 
 
 def test_a_receiver_that_is_ignored_has_a_remedy_for_each_firmware() -> None:
@@ -197,28 +151,10 @@ def test_only_sticks_that_end_give_the_vehicle_to_the_receiver(
     assert ("put the throttle in the middle" in row.advice) == (receiver_us is not None)
 
 
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_a_policy_of_setpoints_has_parameters_of_its_own(autopilot: AutopilotName) -> None:
-    rows = Bench(autopilot).check(contract=Contract(action="rates"))
-    timeout, mode = {"ardupilot": ("GUID_TIMEOUT", "GUIDED"), "px4": ("COM_OF_LOSS_T", "OFFBOARD")}[
-        autopilot
-    ]
-    assert timeout in rows
-    assert mode in rows["modes"].found
-    assert "hover thrust" in rows
-    assert "full lean" not in rows
-
-
-def test_a_vehicle_that_obeys_another_system_is_a_no_go_with_its_flag() -> None:
-    row = Bench(params={"MAV_GCS_SYSID": 42}).check()["MAV_GCS_SYSID"]
-    assert row.verdict == "no-go"
-    assert "--set-config link.source_system=42" in row.commands
-
-
 def test_an_armed_vehicle_is_a_warning() -> None:
     bench = Bench(params=SAFE)
     bench.clock.sleep_until_ns(bench.clock.now_ns() + 3 * NS_PER_S)
-    bench.arm()
+    assert bench.vehicle.ap.arm(force=True)  # whatever its own checks say
     assert bench.check()["state"].verdict == "warn"
 
 
@@ -230,8 +166,8 @@ def test_a_vehicle_that_answers_nothing_is_one_no_go() -> None:
 
 def test_nothing_is_sent_but_requests() -> None:
     bench = Bench(params=SAFE)
-    sent = bench.log_sent()
     bench.check(contract=Contract())
+    sent = bench.up.sent
     messages = {data[7] | data[8] << 8 for _, data in sent}
     assert not messages & {69, OVERRIDE, 82, 84, 23, 253}, "nothing that moves, sets or announces"
     commands = [int.from_bytes(data[38:40], "little") for _, data in sent if data[7] == 76]
@@ -240,8 +176,7 @@ def test_nothing_is_sent_but_requests() -> None:
 
 def test_a_vehicle_that_is_absent_is_one_clear_no_go() -> None:
     bench = Bench()
-    bench.stepper.watchers.clear()
-    bench.vehicle.take_outgoing = lambda link: b""  # type: ignore[method-assign]
+    bench.down.is_silent = True
     began_ns = bench.clock.now_ns()
     rows = bench.check(connect_timeout=3.0)
     assert list(rows) == ["vehicle"]
@@ -256,7 +191,7 @@ def test_a_vehicle_that_falls_silent_while_it_is_measured_is_a_no_go(
     bench, restart = Bench(), MavlinkLink.restart_counters
 
     def mute() -> None:
-        bench.vehicle.take_outgoing = lambda link: b""  # type: ignore[method-assign]
+        bench.down.is_silent = True
 
     def begin(link: MavlinkLink) -> None:
         restart(link)

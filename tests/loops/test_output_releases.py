@@ -4,18 +4,20 @@ Limits are those of docs/safety.md; the vehicle leans 15 degrees or flies 2 m/s 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import pytest
 
 from helpers.output_flights import COMBINATIONS, HOVERING, OutputFlight
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
-from mavbridge.guard.values import EndRequest, Phase
+from mavbridge.guard.values import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind
 from policy.motion.controllers import Motion, Program, Push
 from sitl.ardupilot.flight_modes import Mode as ArduMode
@@ -48,7 +50,6 @@ MESSAGES: tuple[tuple[AutopilotName, ActionKind], ...] = (
     ("px4", "velocity"),
 )
 """Each message that a command may be."""
-RAMP_S = 0.3
 
 
 def later(flight: OutputFlight, seconds: float, act: Callable[[], object]) -> None:
@@ -169,7 +170,9 @@ def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     release: Px4Release, end: Callable[[OutputFlight], None]
 ) -> None:
     """Full yaw is the longest rest: 0.57 of the policy's is 0.88 of the vehicle's stick."""
-    flight = OutputFlight("px4", "sticks", FULL_YAW, px4_release=release)
+    flight = OutputFlight(
+        "px4", "sticks", FULL_YAW, vehicle=replace(NOMINAL_VEHICLE, px4_release=release)
+    )
     flight.fly(1.2)
     assert flight.px4.stick_input.sticks.yaw > 0.85
     at_s = flight.t_s
@@ -228,7 +231,7 @@ def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_th
     flight.launch().run(0.3)
     flight.vehicle.set_receiver((*sticks_us, 2000))
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=1.0)
-    flight._begin_program()
+    flight.begin_program()
     flight.run(1.2)
     assert flight.px4.stick_input.source != RC_SOURCE
     if end is not None:
@@ -301,27 +304,6 @@ def test_the_failsafe_of_a_dead_receiver_is_left_alone_after_a_takeover_to_hold(
     assert flight.px4.mode_name == "AUTO.RTL", flight.describe()
 
 
-def test_the_key_lands_a_vehicle_that_is_held_after_the_flight_process_failed() -> None:
-    flight = OutputFlight("px4", "sticks").fly(1.2)
-    flight.tell(EndRequest(because(Code.CAMERA_FAILED, camera=""), is_fault=True))
-    flight.run(2.0)
-    assert (flight.phase, flight.px4.mode_name) == (Phase.HOLDING, "AUTO.LOITER")
-    flight.act("release")
-    flight.run(2.0)
-    assert (flight.phase, flight.px4.mode_name) == (Phase.HOLDING, "AUTO.LAND")
-    assert flight.codes == (Code.OPERATOR,)
-
-
-def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:
-    flight = OutputFlight("px4", "sticks", mode="ALTCTL")
-    flight.put_in_air()
-    flight._forget_sticks()
-    flight.until(lambda: flight.codes == (Code.NOT_ENGAGED,), within_s=10)
-    flight.act("engage")
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=2.0)
-    assert flight.px4.mode_name == "ALTCTL"
-
-
 @pytest.mark.parametrize(("autopilot", "kind"), MESSAGES)
 def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: ActionKind) -> None:
     flight = OutputFlight(autopilot, kind).fly(1.2)
@@ -340,22 +322,6 @@ def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: Act
     if kind != "sticks":
         names = {m.get_type() for _, m in flight.left(heard_ns + 1)}
         assert not names & {"SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED"}, "silence"
-
-
-def test_a_pilots_stick_ramp_takes_px4_out_of_offboard() -> None:
-    """Another station's joystick is centred for half a second, then moves fast."""
-    flight = OutputFlight("px4", "rates").fly(1.2)
-    at_s = flight.t_s
-    for step in range(100):
-        x = round(800 * min(max(0.02 * step - 0.5, 0.0) / RAMP_S, 1.0))
-        flight.station(lambda mav, x=x: mav.manual_control_encode(1, x, 0, 500, 0, 0), system=42)  # type: ignore[misc]
-        flight.run(0.02)
-    found = flight.aftermath(at_s)
-    assert found.mode == found.final_mode == "POSCTL"
-    assert not found.flew_again
-    assert flight.codes == (Code.MODE_CHANGED,)
-    assert flight.phase is Phase.RELEASED
-    assert not flight.modes_asked()[1:], "only OFFBOARD itself was asked for"
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), MESSAGES)
@@ -423,7 +389,8 @@ def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_he
 @pytest.mark.parametrize("phase_ms", [150, 810])
 def test_a_takeover_on_px4_without_current_mode_is_seen_within_100_ms(phase_ms: int) -> None:
     """Its HEARTBEAT comes once a second: 204 to 947 ms of the policy's actions, by its phase."""
-    flight = OutputFlight("px4", "rates", px4_release="1.14").fly(1.5 + phase_ms / 1000)
+    old = replace(NOMINAL_VEHICLE, px4_release="1.14")
+    flight = OutputFlight("px4", "rates", vehicle=old).fly(1.5 + phase_ms / 1000)
     flight.pilot_changes_mode()
     began_s = flight.now_s
     flight.until(lambda: flight.phase is not Phase.FLYING, within_s=2.0)

@@ -1,10 +1,8 @@
 """The way in: takeoff by the autopilot's own means, and what may happen meanwhile."""
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.output_flights import HOVERING, OutputFlight
-from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
 from policy.contract import ActionKind
 from sitl.vehicle.config import AutopilotName
@@ -44,23 +42,6 @@ def test_the_policy_flies_at_the_height_of_the_takeoff(
     assert flight.phase is Phase.FLYING, flight.describe()
     assert flight.height_m == pytest.approx(HEIGHT_M, abs=0.8)
     assert not any(s.failsafe for s in flight.samples)
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), TAKEOFFS[::3])
-def test_a_pilots_mode_during_the_takeoff_is_final(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    flight = taking_off(autopilot, kind)
-    before_ns = flight.clock.now_ns()
-    main, sub = (4, 6) if flight.is_px4 else (9, 0)  # both: land
-    flight.command(dialect.MAV_CMD_DO_SET_MODE, 1, main, sub)
-    flight.until(lambda: flight.phase is not Phase.PREPARING, within_s=0.1)
-    flight.run(3)
-    assert Code.MODE_CHANGED in flight.codes, flight.reason
-    assert flight.samples[-1].mode == ("AUTO.LAND" if flight.is_px4 else "LAND")
-    assert flight.phase in (Phase.RELEASED, Phase.ENDED)
-    assert not flight.modes_asked(before_ns)
-    assert not setpoints(flight, flight.clock.now_ns() - 2 * 10**9)
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), TAKEOFFS[1:3])
