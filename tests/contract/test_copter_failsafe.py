@@ -40,13 +40,6 @@ def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(fl
     assert not [text for text in texts_in(held + released) if "ailsafe" in text]
 
 
-def test_a_short_lifetime_of_overrides_ends_them_sooner(flying):
-    flying.set_param("RC_OVERRIDE_TIME", 0.5)
-    flying.hold(1.0, roll=1700)
-    levelled = flying.advance(1.0)
-    assert math.degrees(abs(last(levelled, "ATTITUDE").roll)) < 2.0
-
-
 def watch_the_ground_station(companion):
     companion.set_param("FS_GCS_TIMEOUT", 1.0)
     companion.set_param("FS_GCS_ENABLE", 1)

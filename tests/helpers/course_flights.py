@@ -9,9 +9,7 @@ from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
 from sitl.pilot.course_guide import CourseGuide
 from sitl.pilot.demonstrator import STICK_AGILITY, StickPositions, expert_sticks
-from sitl.pilot.disturbance import Disturbance
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
-from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 TICK_NS = NS_PER_S // 100
@@ -24,8 +22,6 @@ LIMIT_S = 60.0
 class Tick:
     pose: Pose
     next_gate: int | None
-    label: StickPositions
-    flown: StickPositions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,11 +63,9 @@ def fly_course(
     course: Course,
     speed_mps: float,
     *,
-    conditions: Conditions = NOMINAL,
     start: AirborneStart | None = None,
-    disturbance: Disturbance | None = None,
 ) -> CourseFlight:
-    config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0, conditions=conditions)
+    config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=course)
     if start is None:
         vehicle.step(50 * STEP_NS)
@@ -91,10 +85,8 @@ def fly_course(
             if now_ns >= over_ns:
                 break
         body, t_s = pose.body, now_ns / NS_PER_S
-        label = expert_sticks(guide, body, t_s)
-        flown = disturbance.flown(label, t_s) if disturbance else label
-        ticks.append(Tick(pose=pose, next_gate=next_gate, label=label, flown=flown))
-        vehicle.ap.rc.override(pwm_us(flown), now_ns)
+        ticks.append(Tick(pose=pose, next_gate=next_gate))
+        vehicle.ap.rc.override(pwm_us(expert_sticks(guide, body, t_s)), now_ns)
         now_ns += TICK_NS
         vehicle.step(now_ns)
     return CourseFlight(course=course, vehicle=vehicle, ticks=ticks)

@@ -31,7 +31,6 @@ def broken_rules(root: Path) -> list[str]:
         _info(info),
         _features(info, rows),
         _rows(info, episodes, rows),
-        _files(root, info, episodes),
         _tasks(root, info, rows),
         _videos(root, info, episodes, rows),
         _stats(root, info),
@@ -93,18 +92,6 @@ def _rows(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[
         for name, values in wanted.items():
             if not np.array_equal(table[name].to_numpy(), values):
                 yield f"{name} of the {what}"
-
-
-def _files(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[str]:
-    for episode in episodes.to_pylist():
-        data = info["data_path"].format(  # dataset_metadata.py: get_data_file_path
-            chunk_index=episode["data/chunk_index"], file_index=episode["data/file_index"]
-        )
-        index = episode["episode_index"]
-        if not (root / data).is_file():
-            yield f"{data} of episode {index} is missing"
-        elif index not in pq.read_table(root / data)["episode_index"].to_pylist():
-            yield f"episode {index} is not in {data}"
 
 
 def _tasks(root: Path, info: dict[str, Any], rows: pa.Table) -> Iterator[str]:

@@ -1,18 +1,17 @@
-"""Policies that see distances, flown on the stepped clock: of Python and of ONNX."""
+"""Policies that see distances: of Python, flown on the stepped clock, of torch and of ONNX."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from onnx import helper
+from onnx import TensorProto
 from torch import Tensor
 
 from helpers.fakes import ListSink
-from helpers.foreign_graphs import FLOAT, save_graph
+from helpers.foreign_graphs import FLOAT, image_actor
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.simulation import flight as simulated
 from mavbridge.simulation.flight import SimulatedFlight
@@ -26,7 +25,6 @@ from policy.engines.runner import (
 from policy.engines.torch_engines import make_torch_runner
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
-from policy.protocol import PolicyRunner
 from sitl.camera.fpv import FpvRenderer
 from sitl.vehicle.rotation import Quat, Vec3
 
@@ -53,11 +51,6 @@ class GroundDepth(FpvRenderer):
         return np.where(depth_m < 65.5, 1000 * depth_m, 0).astype(np.uint16)
 
 
-@pytest.fixture(autouse=True)
-def depth_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
-
-
 class HoldsDistance:
     """Climbs until the ground below is as far as it should be."""
 
@@ -73,22 +66,17 @@ class HoldsDistance:
         return chunk
 
 
-def height_flown_m(runner: PolicyRunner, *sinks: ListSink) -> float:
-    flight = SimulatedFlight(course_seed=3, seed=0)
-    result = flight.fly(runner, max_time_s=6.0, sinks=sinks)
-    assert result.outcome == "timed out", result
-    return -flight.vehicle.ap.truth.position_ned_m[2]
-
-
-def test_a_policy_in_python_flies_by_metres() -> None:
+def test_a_policy_in_python_flies_by_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
     policy, sink = HoldsDistance(), ListSink()
     runner = make_numpy_runner(policy, ExecutionSettings(name="deep", dual_rate=False))
-    height_m = height_flown_m(runner, sink)
+    flight = SimulatedFlight(course_seed=3, seed=0)
+    assert flight.fly(runner, max_time_s=6.0, sinks=(sink,)).outcome == "timed out"
     assert {image.shape for image in policy.seen} == {(1, 1, SIDE, SIDE)}
     assert {image.dtype for image in policy.seen} == {np.dtype(np.float32)}
     held_m = policy.seen[-1][..., SIDE // 2 :, :].mean()
     assert held_m == pytest.approx(HELD_M, abs=1.0)
-    assert 0.5 < height_m < 4
+    assert 0.5 < -flight.vehicle.ap.truth.position_ned_m[2] < 4
     assert {vision.rgb.dtype for vision in sink.visions} == {np.dtype(np.uint16)}
     assert {vision.fault for vision in sink.visions} == {None}
 
@@ -116,54 +104,40 @@ class TwoRates(torch.nn.Module):
         return self.predict_fast(image.mean(dim=(3, 4, 5)), state, history, steps)
 
 
+def metres(*shape: int) -> np.ndarray:
+    """Images of 1, 2, 3 ... metres, each of one distance, as cameras send them."""
+    each = 1000 * np.arange(1, np.prod(shape) + 1, dtype=np.uint16).reshape(*shape, 1, 1)
+    return np.broadcast_to(each, (*shape, 40, 50))
+
+
 @pytest.mark.parametrize("dual_rate", [True, False])
 def test_a_policy_in_torch_gets_metres_of_all_cameras_and_times(dual_rate: bool) -> None:
     settings = ExecutionSettings(name="deep", dual_rate=dual_rate)
     runner = make_torch_runner(TwoRates(), settings)
-    metres = np.array([[1, 2], [3, 4]], np.uint16)
-    images = np.broadcast_to(1000 * metres[..., None, None], (2, 2, 40, 50)).astype(np.uint16)
     state, history = level_state(TwoRates.contract), np.zeros((1, 4, 4), np.float32)
-    chunk = runner.act(encode_all(runner, images), state, history)
+    chunk = runner.act(encode_all(runner, metres(2, 2)), state, history)
     assert chunk[0, 0] == pytest.approx([1, 2, 3, 4])
 
 
-def actor(path: Path, *, kind: int = FLOAT) -> None:
-    """depth [1, 1, 32, 32] -> actions [1, 4]: as ``HoldsDistance``, by the mean of all pixels."""
-    nodes = [
-        helper.make_node("Cast", ["depth"], ["metres"], to=FLOAT),
-        helper.make_node("ReduceMean", ["metres"], ["mean"], keepdims=0),
-        helper.make_node("Sub", ["held", "mean"], ["lacks"]),
-        helper.make_node("Mul", ["lacks", "gain"], ["throttle"]),
-        helper.make_node("Clip", ["throttle", "least", "most"], ["actions"]),
-    ]
-    weights = {
-        "held": np.full((1, 4), HELD_M / 2, np.float32),  # the upper half is the sky: 0 m
-        "gain": np.array([[2 * GAIN, 0, 0, 0]], np.float32),
-        "least": np.float32(-0.5),
-        "most": np.float32(0.5),
-    }
-    inputs = {"depth": (kind, (1, 1, SIDE, SIDE))}
-    save_graph(path, nodes, inputs, {"actions": (FLOAT, (1, 4))}, weights)
-
-
-def request(folder: Path) -> PolicyRequest:
+def request(folder: Path, kind: int) -> PolicyRequest:
+    """A graph that gives the mean of its image."""
+    image_actor(folder / "policy.onnx", kind=kind, shape=(1, 1, SIDE, SIDE))
     (folder / "mavbridge.toml").write_text(
         '[contract]\nhorizon = 1\nchunk_dt_s = 0.05\nimage_channels = "depth"\n'
         f"image_height = {SIDE}\nimage_width = {SIDE}\n"
-        '[images]\nfront = "depth"\n'
+        '[images]\nfront = "image"\n'
     )
     return PolicyRequest(spec=f"onnx:{folder / 'policy.onnx'}")
 
 
-def test_a_graph_flies_by_metres(tmp_path: Path) -> None:
-    actor(tmp_path / "policy.onnx")
-    with load_policy(request(tmp_path), now_s=lambda: 0.0) as loaded:
-        assert loaded.runner.contract.is_depth
-        height_m = height_flown_m(loaded.runner)
-    assert 0.5 < height_m < 4
+def test_a_graph_gets_metres(tmp_path: Path) -> None:
+    with load_policy(request(tmp_path, FLOAT), now_s=lambda: 0.0) as loaded:
+        runner = loaded.runner
+        state, history = level_state(runner.contract), np.zeros((1, 4, 4), np.float32)
+        chunk = runner.act(encode_all(runner, metres(1, 1)), state, history)
+    assert chunk[0, 0] == pytest.approx([1, 1, 1, 1])
 
 
 def test_a_graph_that_takes_bytes_is_no_policy_of_depth(tmp_path: Path) -> None:
-    actor(tmp_path / "policy.onnx", kind=onnx.TensorProto.UINT8)
     with pytest.raises(MavbridgeError, match="depth in metres"):
-        load_policy(request(tmp_path), now_s=lambda: 0.0)
+        load_policy(request(tmp_path, TensorProto.UINT8), now_s=lambda: 0.0)

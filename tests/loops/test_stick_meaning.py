@@ -12,7 +12,6 @@ from helpers.pilots import steady
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
-from policy.motion.stick_loop import flown_by_rates
 from sitl.vehicle.dynamics import BodyState
 from sitl.vehicle.rotation import cos_tilt
 
@@ -32,7 +31,7 @@ class Moved:
     """The sticks, as the policy hears of them."""
 
 
-def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool = False) -> Moved:
+def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0) -> Moved:
     """What a vehicle does after six seconds of climbing and three of ``STICKS``."""
     flight = SimulatedFlight(
         course_seed=3,
@@ -57,8 +56,7 @@ def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool
             seen.append(flight.vehicle.ap.truth)
 
     flight.step_watchers.append(watch)
-    policy = flown_by_rates(steady(sticks)) if is_by_rates else steady(sticks)
-    assert flight.fly(policy, max_time_s=FLOWN_S, sinks=(sink,)).outcome == "timed out"
+    assert flight.fly(steady(sticks), max_time_s=FLOWN_S, sinks=(sink,)).outcome == "timed out"
     sent = [tick.sent for tick in sink.ticks if tick.trace is not None and tick.sent is not None]
     return Moved(
         climb_mps=-float(np.mean([body.velocity_ned_mps[2] for body in seen])),
@@ -68,31 +66,11 @@ def moved(*, autopilot: Any = "ardupilot", gains: float = 1.0, is_by_rates: bool
     )
 
 
-@pytest.fixture(scope="module")
-def trained() -> Moved:
-    return moved()
-
-
-@pytest.mark.parametrize(
-    "vehicle",
-    [{"gains": 2.0}, {"autopilot": "px4"}],
-    ids=["twice", "px4"],
-)
-def test_sticks_mean_the_same_to_every_vehicle(vehicle: dict[str, Any], trained: Moved) -> None:
-    mapped = moved(**vehicle)
-    assert mapped.lean_deg == pytest.approx(trained.lean_deg, abs=0.7)
-    assert mapped.yaw_rate_degps == pytest.approx(trained.yaw_rate_degps, rel=0.05)
-    # The copter of the training sinks 0.05 m/s faster than its contract says, for RC3_DZ.
-    assert mapped.climb_mps == pytest.approx(trained.climb_mps, abs=0.07)
-    assert mapped.sent == pytest.approx(STICKS, abs=0.01)
-
-
-@pytest.mark.parametrize(("autopilot", "climb_mps"), [("ardupilot", 0.15), ("px4", 0.3)])
-def test_by_rates_the_policy_flies_them_as_the_autopilot_does(
-    autopilot: str, climb_mps: float, trained: Moved
-) -> None:
-    """Its climb has no integral: PX4's airframe, whose drag pushes up in a lean, sinks less."""
-    by_policy = moved(autopilot=autopilot, is_by_rates=True)
-    assert by_policy.lean_deg == pytest.approx(trained.lean_deg, abs=0.7)
-    assert by_policy.yaw_rate_degps == pytest.approx(trained.yaw_rate_degps, rel=0.05)
-    assert by_policy.climb_mps == pytest.approx(trained.climb_mps, abs=climb_mps)
+def test_sticks_mean_the_same_to_every_vehicle() -> None:
+    trained, *others = moved(), moved(gains=2.0), moved(autopilot="px4")
+    for mapped in others:
+        assert mapped.lean_deg == pytest.approx(trained.lean_deg, abs=0.7)
+        assert mapped.yaw_rate_degps == pytest.approx(trained.yaw_rate_degps, rel=0.05)
+        # The copter of the training sinks 0.05 m/s faster than its contract says, for RC3_DZ.
+        assert mapped.climb_mps == pytest.approx(trained.climb_mps, abs=0.07)
+        assert mapped.sent == pytest.approx(STICKS, abs=0.01)

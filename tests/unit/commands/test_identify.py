@@ -54,13 +54,10 @@ def recorded(
     hover: float = 0.0,
     lag_s: float = LAG_S,
     noise: float = 0.0,
-    most_change: float = math.inf,
-    feedback: float = 0.0,
     is_flown: Callable[[float], bool] = lambda _: True,
 ) -> ResponseRecording:
     """A doublet of this kind, flown by a vehicle of first order with a dead time, in gusts where
-    there is ``noise``, a share of the full amount; ``most_change`` limits its motion, per s;
-    ``feedback`` is the share of the last actions before the end of each push."""
+    there is ``noise``, a share of the full amount."""
     random = np.random.default_rng(0)
     recording = ResponseRecording()
     amounts = {"sticks": 1.0, "attitude": 20.0, "rates": 40.0, "velocity": 2.0}
@@ -74,19 +71,15 @@ def recorded(
         blown = noise * amounts[kind] * (random.normal() + 10.0 * is_gust)
         state = _state({axis: value + blown for axis, value in motions.items()}, kind, at_ns)
         pushes = [push for step in doublet_steps(kind) if (push := step.push_at(time_s))]
-        returns = [s.axis for s in doublet_steps(kind) if 0.0 < s.end_s - time_s < 2.5 * STEP_S]
         action = [0.0] * 4
         if kind in ("attitude", "rates"):
             action[0] = hover
         for axis, channel in channels.items():
             amount = sum(push.share for push in pushes if push.axis == axis) * amounts[kind]
-            if feedback and axis in returns:
-                amount = feedback * amounts[kind]
             action[channel.column] = amount / channel.scale
             waiting[axis].append(amount)
             wanted = curve(axis, waiting[axis].pop(0))
-            change = float(np.clip((wanted - motions[axis]) / lag_s, -most_change, most_change))
-            motions[axis] += change * STEP_S
+            motions[axis] += (wanted - motions[axis]) / lag_s * STEP_S
         trace = make_trace(ACTION_CLASSES[kind](*action))  # type: ignore[arg-type]
         tick = make_tick(index, trace=trace, sent_ns=at_ns, state=state)
         recording.emit(tick if is_flown(time_s) else make_released_tick(index))
@@ -146,23 +139,6 @@ def test_each_side_has_its_gain_in_gusts_too_and_if_it_settles_late(
     for push in found.pushes:
         assert push.ratio == pytest.approx((1.0, 0.7), abs=0.05), push
         assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + lag_s, abs=0.04), push
-
-
-def test_feedback_that_returns_before_the_end_of_a_push_is_no_part_of_it() -> None:
-    found = identified(recorded(feedback=-1.0))
-    assert [push.action[1] for push in found.pushes] == pytest.approx(
-        [-step.share for step in doublet_steps("sticks")]
-    )
-    for push in found.pushes:
-        assert push.measured[1] == pytest.approx(usual_sticks(push.axis, push.action[1]), rel=0.03)
-
-
-def test_a_limited_rate_of_lean_alters_no_gain_and_the_lag_little() -> None:
-    recording = recorded("attitude", lambda axis, amount: amount, lag_s=0.1, most_change=35.0)
-    found = identified(recording, Contract(action="attitude"))
-    for push in (push for push in found.pushes if push.axis != "yaw"):
-        assert push.ratio == pytest.approx((1.0, 1.0), abs=0.03), push
-        assert 0.16 < push.time_63_s < 0.3, push
 
 
 def test_what_could_not_be_measured_is_told_beside_every_figure() -> None:

@@ -4,13 +4,11 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
-from faults import processes, steps
+from faults import processes
 from faults.processes import leaks, processes_with, thread_names
-from helpers.fakes import FakeClock
 
 
 def test_a_process_a_thread_memory_and_a_file_are_named(
@@ -38,19 +36,3 @@ def test_a_process_a_thread_memory_and_a_file_are_named(
             process.communicate()
     assert left[0].startswith(f"process {process.pid}: ")
     assert left[1:] == ["shared memory psm_test", "temporary psm_test", "thread left-over"]
-
-
-def test_a_load_that_is_interrupted_leaves_no_program_behind(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def interrupt(_s: float) -> None:
-        raise KeyboardInterrupt
-
-    hogs: list[subprocess.Popen[bytes]] = []
-    start = subprocess.Popen
-    monkeypatch.setattr(
-        subprocess, "Popen", lambda command: hogs.append(start(command)) or hogs[-1]
-    )
-    with pytest.raises(KeyboardInterrupt):
-        steps.load(SimpleNamespace(clock=FakeClock(), observe=interrupt), s=1.0)
-    assert [hog.returncode for hog in hogs] == [-9] * len(hogs) != []

@@ -117,18 +117,6 @@ def test_one_damaged_heartbeat_gives_a_vehicle_no_other_type(types: str) -> None
     assert vehicle.vehicle_type == 2
 
 
-def test_a_vehicle_is_followed_however_often_it_moves() -> None:
-    discovery = VehicleDiscovery(target_system=0)
-    discovery.receive(Endpoint(1, 1), heartbeat(), ("host", 0), 0)
-    vehicle = discovery.choose(2 * S)
-    for port in range(1, 200):
-        assert vehicle is not None
-        discovery.receive(Endpoint(1, 1), heartbeat(), ("host", port), 10 * S * port)
-        vehicle = discovery.moved(vehicle, 10 * S * port)
-    assert vehicle is not None
-    assert vehicle.address == ("host", 199)
-
-
 @pytest.mark.parametrize(
     ("heard", "expected"),
     [

@@ -2,13 +2,10 @@
 
 import os
 from collections.abc import Iterator
-from datetime import datetime
 from pathlib import Path
 
 import pytest
-from pymavlink import mavutil
 
-from helpers.wire import WireEnd
 from mavbridge.core.errors import UserError
 from mavbridge.mavlink.codec.tlog import PacketPipe, read_tlog
 
@@ -65,29 +62,6 @@ def test_after_the_reader_is_gone_everything_is_counted_and_nothing_is_raised() 
     log.close()
     log.put(0, b"late")
     assert log.dropped == 6
-
-
-def test_pymavlink_reads_the_log(tmp_path: Path) -> None:
-    path, end = tmp_path / "link.tlog", WireEnd()
-    unix_ns = 1_700_000_000_123_456_789
-    fd = os.open(path, os.O_CREAT | os.O_WRONLY)
-    log = PacketPipe(fd, wall_offset_ns=unix_ns - 5_000_000_000)
-    for k in range(5):
-        stamp_ns = 5_000_000_000 + k * 10_000_000
-        sent = end.pack(end.mav.manual_control_encode(1, k, 0, 0, 0, 0))
-        log.put(stamp_ns, end.heartbeat())
-        log.put(stamp_ns + 2_000_000, sent)
-    log.close()
-    reader = mavutil.mavlogfile(str(path))
-    read = []
-    while (message := reader.recv_msg()) is not None:
-        read.append(message)
-    reader.f.close()
-    assert [m.get_type() for m in read] == ["HEARTBEAT", "MANUAL_CONTROL"] * 5
-    assert [m.x for m in read[1::2]] == [0, 1, 2, 3, 4]
-    assert read[1]._timestamp - read[0]._timestamp == pytest.approx(0.002, abs=1e-5)
-    first = datetime.fromtimestamp(read[0]._timestamp)
-    assert abs(first.timestamp() - unix_ns / 1e9) < 1e-4
 
 
 def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:

@@ -213,17 +213,6 @@ def test_the_command_exports_what_train_can_read(tmp_path: Path) -> None:
     assert len(read_dataset(tmp_path / "all")) == 3
 
 
-def test_a_flight_in_which_nobody_flew_does_not_keep_the_others_back(tmp_path: Path) -> None:
-    fly(tmp_path / "flights" / "flown")
-    fly(tmp_path / "flights" / "idle", expert=False, released=range(200))
-    status, text = told_by("export", tmp_path / "flights", "--out", tmp_path / "out")
-    assert (status, "idle: nobody to learn from" in text, "1 episodes" in text) == (0, True, True)
-    small = ("--policy", "toge:small:resnet8", "--image-size", "32", "--steps", "1")
-    out = ("--out", tmp_path / "a.safetensors")
-    status, text = told_by("train", tmp_path / "flights", *out, *small)
-    assert (status, "idle: nobody to learn from" in text) == (0, True)
-
-
 def _flights(*each: dict[str, Any]) -> Callable[[Path], None]:
     def prepare(root: Path) -> None:
         for number, changes in enumerate(each):

@@ -236,19 +236,6 @@ def test_missing_values_have_no_key(flight: File) -> None:
     assert set(flight.of("/actions")[-1].message) == {"rc_sticks"}
 
 
-def test_a_flight_that_was_killed_is_exported_as_far_as_it_was_written(tmp_path: Path) -> None:
-    folder = record(tmp_path / "a", ticks=1000, finish=False)
-    (folder / "ticks.arrows").write_bytes((folder / "ticks.arrows").read_bytes()[:-100])
-    (folder / "camera.mp4").write_bytes((folder / "camera.mp4").read_bytes()[:-3000])
-    file = exported(folder, tmp_path / "out")
-    images = [number_of(image_of(entry)) for entry in file.of("/camera/front")]
-    assert images == list(range(len(images)))
-    assert 0 < len(images) < FRAMES
-    rows = len(file.of("/timing"))
-    assert 0 < rows < 1000
-    assert len(file.of("/actions")) == rows
-
-
 def test_every_camera_has_a_topic(tmp_path: Path) -> None:
     folder = record(tmp_path / "a", contract=Contract(cameras=("front", "down")))
     copy(folder / "camera.mp4", folder / "camera_down.mp4")

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.recordings import count_frames, read_video
-from helpers.rollouts import SIZE, Finished, make_plan, make_sampler, read_rows, run, segments
+from helpers.recordings import count_frames
+from helpers.rollouts import Finished, make_plan, make_sampler, read_rows, run, segments
 from mavbridge.commands.imagine.loop import DECIDE, SIMULATE, RolloutPlan
 
 THREAD = "mavbridge-rollout-decode"
@@ -87,16 +87,3 @@ def test_fewer_frames_are_the_first_of_each_segment(tmp_path: Path) -> None:
     assert few.equals(executed)
     assert count_frames(tmp_path / "few.mp4") == 12
     np.testing.assert_allclose(few["time_s"].to_pylist(), 0.1 * np.arange(1, 13))
-
-
-def test_a_frame_is_a_row(tmp_path: Path) -> None:
-    ours = run(tmp_path / "a.mp4", make_plan(exe_steps=2))  # with a real writer process
-    rows = read_rows(tmp_path / "a.mp4")
-    images = list(read_video(tmp_path / "a.mp4"))
-    assert len(images) == rows.num_rows == ours.output.frames == 48
-    assert images[0].shape == (SIZE, SIZE, 3)
-    assert rows["iteration"].to_pylist() == [k for k in range(3) for _ in range(16)]
-    assert rows["frame"].to_pylist() == list(range(16)) * 3
-    assert rows["executed"].to_pylist() == ([True] * 2 + [False] * 14) * 3
-    assert rows["time_s"][16].as_py() == pytest.approx(0.3)  # two steps were executed before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "a.parquet"]

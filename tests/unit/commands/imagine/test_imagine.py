@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from helpers.recordings import count_frames, read_video
 from helpers.rollouts import TinyWorld, read_rows, write_flight
@@ -38,18 +37,6 @@ def imagine(folder: Path, tmp_path: Path) -> Imagine:
     """Imagine into ``a.mp4``; returns exit status and output."""
     given = ("--start", folder / "flight", "--world-model", folder / "world.safetensors")
     return partial(told_by, "imagine", *given, "--out", tmp_path / "a.mp4", "--ddim-steps", "1")
-
-
-def test_sampling_leaves_a_core_to_decoding(
-    imagine: Imagine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[int] = []
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
-    monkeypatch.setattr(torch, "set_num_threads", asked.append)
-    status, text = imagine("--n-iter", "1")
-    assert status == 0, text
-    assert asked[0] == 7
-    assert asked[-1] == 8, "what it was before"
 
 
 def test_without_a_video_there_are_rows_and_nothing_is_decoded(

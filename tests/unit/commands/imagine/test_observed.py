@@ -1,6 +1,5 @@
 """From a recorded flight to the start of a rollout, and what a decider observes."""
 
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 from helpers.factories import START_NS
-from helpers.recordings import InProcessWriter
 from helpers.rollouts import (
     SIZE,
     TINY,
@@ -19,17 +17,14 @@ from helpers.rollouts import (
     make_sampler,
     make_start,
     noise_runner,
-    run,
     write_flight,
 )
 from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider, rollout
-from mavbridge.commands.imagine.output import QUEUED_SEGMENTS
 from mavbridge.commands.imagine.run import read_start
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.rows import FrameRow
 from mavbridge.simulation.clock import SteppedClock
 from policy.contract import Contract
 
@@ -197,25 +192,3 @@ def test_the_history_is_in_seconds_before_and_after_the_start() -> None:
     np.testing.assert_allclose(throttle[0], [0.1, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(throttle[1], [0.1, 0.1, 0.1, 0.1], rtol=1e-6)
     np.testing.assert_allclose(throttle[2], [0.1, 0.1, 0.2, 0.2], rtol=1e-6)
-
-
-def test_no_frame_is_held_for_longer_than_a_queue_is_long(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames, seen, held = 4, list[weakref.ref[object]](), list[int]()
-    submit = InProcessWriter.submit
-
-    def watched(video: InProcessWriter, rgb: ImageArray, row: FrameRow) -> None:
-        seen.append(weakref.ref(rgb))
-        held.append(sum(one() is not None for one in seen))
-        submit(video, rgb, row)
-
-    monkeypatch.setattr(InProcessWriter, "submit", watched)
-    run(
-        tmp_path / "a.mp4",
-        make_plan(iterations=96, frames=frames, exe_steps=2),
-        decider="toge",
-    )
-    assert len(seen) == 96 * frames
-    # A segment in hand, and what the loop observes.
-    assert max(held) <= frames + QUEUED_SEGMENTS * frames + 2

@@ -132,21 +132,16 @@ def test_a_crash_is_bad_by_itself_and_a_mark_has_the_last_word(stand: Stand) -> 
     assert stand.flight(1).meta.crash == meta.crash
 
 
-def test_an_episode_cannot_go_on_after_a_crash_or_without_its_recorder(stand: Stand) -> None:
+def test_an_episode_cannot_go_on_after_a_crash_or_without_recorder_or_images(stand: Stand) -> None:
     stand.episodes.begin()
     episode = stand.episodes.current
     assert episode.obstacle is None
     episode.recorder._flight.crash_watch.reason = "it fell"
     assert episode.obstacle == "a crash (it fell)"
-    episode.recorder.failure = "the disk is full"
-    assert episode.obstacle == "an error (the disk is full)"
-
-
-def test_an_episode_cannot_go_on_without_its_images(stand: Stand) -> None:
-    stand.episodes.begin()
-    episode = stand.episodes.current
     episode.recorder._flight.writer.video_failure = WriterDiedError("the writer process has died")
     assert episode.obstacle == "an error (the writer process has died)"
+    episode.recorder.failure = "the disk is full"
+    assert episode.obstacle == "an error (the disk is full)"
 
 
 def test_a_later_session_goes_on_counting(stand: Stand) -> None:

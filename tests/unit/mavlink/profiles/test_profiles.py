@@ -16,6 +16,7 @@ from mavbridge.mavlink.profiles.profile import NoteKind, ParamContext, ParamNote
 from mavbridge.mavlink.profiles.px4 import PX4, event_id
 from mavbridge.mavlink.session.vehicle import require_profile
 
+RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 6.0}
 BOTH = pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
 
 
@@ -175,6 +176,11 @@ def test_advice(
         ({"RC_OPTIONS": 34.0}, "rc-override", "RC_OPTIONS is 34, .* bit 1 .* --set RC_OPTIONS=32"),
         ({"RC_OPTIONS": 32.0}, "rc-override", None),
         ({"RC_OVERRIDE_TIME": 0.0}, "rc-override", "RC_OVERRIDE_TIME is 0"),
+        # switches of the pilot's own
+        *(
+            (RCMAP | {name: value}, "rc-override", None)
+            for name, value in (("RC7_OPTION", 4.0), ("RC8_OPTION", 46.0), ("FLTMODE_CH", 5.0))
+        ),
     ],
 )
 def test_what_a_copter_would_not_follow_is_an_obstacle(
@@ -182,9 +188,6 @@ def test_what_a_copter_would_not_follow_is_an_obstacle(
 ) -> None:
     found = "; ".join(note.text for note in notes_of(ARDUPILOT, values, output))
     assert re.search(expected, found) if expected else found == ""
-
-
-RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 6.0}
 
 
 @pytest.mark.parametrize(
@@ -227,13 +230,6 @@ def test_a_half_of_a_stick_inside_its_dead_zone_is_refused(
     notes = notes_of(ARDUPILOT, RCMAP | radio | change, "rc-override")
     assert [note.kind for note in notes] == ["obstacle"] * is_refused
     assert all("hides one half of the stick of RCMAP_" in note.text for note in notes)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("RC7_OPTION", 4.0), ("RC8_OPTION", 46.0), ("FLTMODE_CH", 5.0)]
-)
-def test_a_switch_of_the_pilots_own_is_none_of_our_sticks(name: str, value: float) -> None:
-    assert notes_of(ARDUPILOT, RCMAP | {name: value}, "rc-override") == []
 
 
 def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
