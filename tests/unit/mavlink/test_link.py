@@ -8,7 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import FakeClock
-from helpers.wire import CALIBRATION, WireEnd
+from helpers.parameters import SAFE
+from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.link_settings import LinkSettings
@@ -31,15 +32,7 @@ from mavbridge.mavlink.transport.connection import Address, Received, TransportD
 from mavbridge.mavlink.transport.sockets import make_transport
 
 MS = NS_PER_MS
-PARAMS = CALIBRATION | {
-    "MAV_GCS_SYSID": 255.0,
-    "RC_OVERRIDE_TIME": 3.0,
-    "RC_OPTIONS": 0.0,
-    "FS_THR_ENABLE": 1.0,
-    "GUID_OPTIONS": 0.0,
-    "ATC_ANGLE_BOOST": 1.0,
-    "MOT_THST_HOVER": 0.39,
-}
+PARAMS = SAFE | {"RC_OVERRIDE_TIME": 3.0}
 
 
 class Vehicle:

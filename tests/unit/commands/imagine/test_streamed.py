@@ -17,6 +17,7 @@ from helpers.recordings import count_frames, read_video, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import RolloutError, Segment
 from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
 
 DEADLINE_S = 60.0
@@ -114,3 +115,19 @@ def test_an_error_of_the_decoder_is_raised_in_the_loop(tmp_path: Path) -> None:
             put_all(made)
         with pytest.raises(RuntimeError, match="out of memory"):
             made.finish()
+
+
+@pytest.mark.usefixtures("in_process_writer")
+def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+
+    class Hangs(TinyWorld):
+        def decode(self, latents: Tensor) -> Tensor:
+            go_on.wait(DEADLINE_S)
+            return super().decode(latents)
+
+    monkeypatch.setattr("mavbridge.commands.imagine.output.STALL_S", 0.0)
+    with output(tmp_path / "a.mp4", Hangs()) as made:
+        with pytest.raises(HungError, match="no frame"):
+            put_all(made)
+        go_on.set()
