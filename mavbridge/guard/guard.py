@@ -120,10 +120,11 @@ class Guard:
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
-        """Discard the last decision, which was not sent; continue from the one before. A read-only
-        flight goes on as if it were sent."""
+        """Discard the last decision, which was not sent; continue from the one before, without a
+        jump for the time that has passed. A read-only flight goes on as if it were sent."""
         if not self.engagement.settings.readonly:
-            self._smoother.state, self._last = self._before
+            tried_ns, (state, self._last) = self._smoother.state.stepped_ns, self._before
+            self._smoother.state = state._replace(stepped_ns=tried_ns)
             self._grid.unserve()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
