@@ -242,7 +242,7 @@ class Code(StrEnum):
     WRONG_KIND = _fault("the policy returned actions of a different kind than its contract names")
     NOT_FINITE = _fault("the policy returned a value that is not finite")
     WRONG_SHAPE = _fault(
-        "the policy returned {shape} instead of [1, horizon, 4], with at most {most} actions"
+        "the policy returned {shape} instead of [1, {most}, 4], by its contract's horizon"
     )
     UNUSABLE_CHUNKS = _fault(
         "the policy returned {chunks} unusable chunks within a short time: {why}"

@@ -25,6 +25,7 @@ from mavbridge.flight.state import (
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
+from policy.contract import ACTION_DIM
 from policy.errors import NoChunkError
 from policy.motion.forward_motion import ForwardMotion
 from policy.protocol import PolicyRunner
@@ -37,8 +38,6 @@ RETRY_NS = 100 * NS_PER_MS
 
 RECENT_SOLVES = 5
 """Solves whose median duration tells when the next chunk will act."""
-MAX_HORIZON = 1024
-"""Most actions in a chunk, as in a contract: the guard reads each one between two sends."""
 
 
 class PolicyLoop:
@@ -75,6 +74,7 @@ class PolicyLoop:
         self._action_frame = ActionFrame(contract)
         self._guard = plan.guard
         self._step_ns = round(contract.chunk_dt_s * NS_PER_S)
+        self._horizon = contract.horizon
         self._prefix_len = contract.prefix_len
         self._period_ns = plan.guard.chunk_period_ns
         """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
@@ -230,10 +230,9 @@ class PolicyLoop:
             self._refuse(because(Code.POLICY_REFUSED, said=str(error)))
             return
         done_ns = self._clock.now_ns()
-        is_chunk = array.ndim == 3 and array.shape[0] == 1 and array.shape[2] == 4
-        if not is_chunk or not 0 < array.shape[1] <= MAX_HORIZON:
+        if array.shape != (1, self._horizon, ACTION_DIM):
             shape = str(list(array.shape))
-            self._refuse(because(Code.WRONG_SHAPE, shape=shape, most=MAX_HORIZON))
+            self._refuse(because(Code.WRONG_SHAPE, shape=shape, most=self._horizon))
             return
         self._serial += 1
         self._solves_ns.append(done_ns - now_ns)

@@ -252,7 +252,15 @@ def _try(runner: PolicyRunner) -> None:
             f"{[1, *contract.state_shape]}, action_history "
             f"{[1, *contract.history_shape]}, as {contract.arrays} arrays"
         ) from error
-    _require(runner, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
+    require_chunk(runner, chunk)
+
+
+def require_chunk(runner: PolicyRunner, chunk: FloatArray) -> None:
+    """Raise NoChunkError if a flight could not use a chunk of a dummy sample."""
+    try:
+        _require(runner, "the chunk", chunk, (1, runner.contract.horizon, ACTION_DIM))
+    except PolicyError as error:
+        raise NoChunkError(str(error)) from None
 
 
 def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:

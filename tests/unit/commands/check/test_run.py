@@ -103,6 +103,40 @@ def test_a_pace_that_is_not_held_is_a_warning(
     assert (pace.late, pace.row().verdict) == (late, verdict)
 
 
+@pytest.mark.parametrize(
+    ("good", "chunk", "verdict", "told"),
+    [
+        pytest.param(7, "raise NoChunkError('warming up')", "no-go", "warming up", id="later"),
+        pytest.param(0, "raise NoChunkError('warming up')", "no-go", "warming up", id="never"),
+        pytest.param(7, "return chunk * np.nan", "no-go", "NaN", id="NaN"),
+        pytest.param(7, "return chunk[:, :2]", "no-go", "[1, 2, 4]", id="shape"),
+        pytest.param(
+            7, "return chunk if self.calls % 3 else chunk * np.nan", "warn", "NaN", id="some"
+        ),
+    ],
+)
+def test_a_policy_without_usable_chunks_is_no_go(
+    good: int, chunk: str, verdict: str, told: str, tmp_path: Path
+) -> None:
+    (file := tmp_path / "later.py").write_text(f"""\
+import numpy as np
+from policy.contract import Contract
+from policy.errors import NoChunkError
+class Later:
+    contract, calls = Contract(arrays="numpy", image_height=32, image_width=32), 0
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        self.calls += 1
+        chunk = np.zeros((1, 16, 4), np.float32)
+        if self.calls <= {good}:
+            return chunk
+        {chunk}
+""")
+    rows, _ = check_policy(flight(f"{file}:Later"), MonotonicClock(), timing_s=0.5)
+    row = next(row for row in rows if row.name == "chunks")
+    assert row.verdict == verdict
+    assert told in row.advice
+
+
 @pytest.mark.parametrize("width", [80, 160])
 def test_the_table_fits_its_terminal_and_ends_with_what_to_do(width: int) -> None:
     out = io.StringIO()
