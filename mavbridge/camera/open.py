@@ -50,19 +50,21 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     """
     kind, _, rest = spec.partition(":")
     mode = _file_mode(spec)
-    if kind == "shm":
-        if latency_ms != 0.0:
-            raise UserError(
-                f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps "
-                "each frame with its exposure; mend the stamps there, or leave the flag out"
-            )
-    elif kind == "pipe":
+    is_file = stat.S_ISREG(mode) and not _is_stream(spec)
+    if latency_ms != 0.0 and (is_file or kind == "shm"):
+        raise UserError(
+            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its frames come with "
+            "stamps of their own; mend those, or leave the flag out"
+        )
+    if kind == "pipe":
         parse_pipe(rest)
     elif kind == "jpeg-udp":
         parse_jpeg_udp(rest)
     elif kind == "screen":
         require_packages("--camera screen:", *SCREEN_PACKAGES)
-    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or stat.S_ISREG(mode)):
+    elif not (
+        is_file or kind == "shm" or spec == NO_CAMERA or _is_stream(spec) or _is_device(spec)
+    ):
         if stat.S_ISFIFO(mode):
             raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")

@@ -60,14 +60,16 @@ def test_a_device_is_known_by_its_kind_and_a_named_pipe_is_told_of_another_way(t
 
 
 @pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
-def test_a_file_plays_from_the_first_read_on_whatever_the_latency(
+def test_a_file_plays_from_the_first_read_on_and_refuses_a_latency(
     name, tmp_path, monkeypatch, clock
 ):
     monkeypatch.chdir(tmp_path)
     writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()
-    camera = open_camera(name, image_size=(224, 224), clock=clock, latency_ms=120.5)
+    with pytest.raises(UserError, match="--camera-latency 120 cannot be used with"):
+        check_camera(name, latency_ms=120)
+    camera = open_camera(name, image_size=(224, 224), clock=clock)
     frame = camera.read(0)
     assert (frame.captured_ns, frame.is_stamped) == (START_NS, True)
     assert frame.rgb.shape == (32, 32, 3)
