@@ -83,7 +83,8 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
             and (value.__module__ == module.__name__ or hasattr(value, "predict"))
         )
         raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
-    return _instance(spec, found, checkpoint, seed)
+    with user_code(f"--policy {spec}: making it failed"):  # its members may be properties
+        return _instance(spec, found, checkpoint, seed)
 
 
 @contextmanager
@@ -173,12 +174,11 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
             f"--policy {spec}: cannot be made with {call}: {error}; its only argument is the "
             "checkpoint of --checkpoint, if that is given"
         ) from error
-    with user_code(f"--policy {spec}: making it failed"):
-        policy: object = found(**arguments)
-        has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
-        if has_pair and getattr(policy, "predict", None) is None:
-            found.predict = predict_by_pair  # type: ignore[attr-defined]
-            getattr(policy, "__dict__", {}).pop("predict", None)  # None of the instance hides it
+    policy: object = found(**arguments)
+    has_pair = all(callable(getattr(policy, name, None)) for name in _FAST_PAIR)
+    if has_pair and getattr(policy, "predict", None) is None:
+        found.predict = predict_by_pair  # type: ignore[attr-defined]
+        getattr(policy, "__dict__", {}).pop("predict", None)  # None of the instance hides it
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch

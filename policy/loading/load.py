@@ -229,10 +229,11 @@ def _scripted(
 
 def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[], None]:
     """Return the policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
-    method: Callable[[], object] | None = getattr(policy, name, None)
+    with user_code(f"{spec} failed to {name}"):
+        method: Callable[[], object] | None = getattr(policy, name, None)
+        with_torch = policy.contract.arrays == "torch"
     if method is None:
         return keep_nothing
-    with_torch = policy.contract.arrays == "torch"
 
     def call() -> None:
         with ExitStack() as stack:

@@ -286,6 +286,18 @@ class ResetFails(Single):
         raise RuntimeError("no memory to clear")
 
 
+class ContractFails(Single):
+    contract = property(lambda self: 1 / 0)
+
+
+class PredictFails(Single):
+    predict = property(lambda self: 1 / 0)
+
+
+class CloseIsMissing(Single):
+    close = property(lambda self: 1 / 0)
+
+
 class NeedsMore:
     def __init__(self, weights):
         pass
@@ -344,6 +356,9 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
         ("SwappedFast", {}, "predict_fast is called with feature, .* has state, feature, history"),
         ("ResetNeedsMore", {}, "failed to reset: TypeError: .*missing 1 required .*'seed'"),
         ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
+        ("ContractFails", {}, r"making it failed: ZeroDivisionError: .*\(.*mine\.py:\d+\)"),
+        ("PredictFails", {}, "making it failed: ZeroDivisionError"),
+        ("CloseIsMissing", {}, "failed to close: ZeroDivisionError"),
         ("FailsInALibrary", {}, r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)"),
         ("NeedsMore", {}, r"cannot be made with Class\(\)"),
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
