@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from inspect import isasyncgenfunction, iscoroutinefunction, isgeneratorfunction
 from pathlib import Path
 
 from policy.adapters.description import Description, OnnxFiles, find_onnx_files, read_description
@@ -28,6 +29,8 @@ from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
 """Forms of --policy for files of other programs."""
+_NOT_PLAIN = (iscoroutinefunction, isgeneratorfunction, isasyncgenfunction)
+"""Kinds of functions of which a call runs nothing."""
 Engine = tuple[PolicyRunner, tuple[str, ...]]
 
 
@@ -234,6 +237,8 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
         with_torch = policy.contract.arrays == "torch"
     if method is None:
         return keep_nothing
+    if any(is_kind(method) for is_kind in _NOT_PLAIN):
+        raise PolicyError(f"{spec}: {name} is async or a generator: make it a plain method")
 
     def call() -> None:
         with ExitStack() as stack:

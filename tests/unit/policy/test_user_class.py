@@ -298,6 +298,16 @@ class CloseIsMissing(Single):
     close = property(lambda self: 1 / 0)
 
 
+class AsyncReset(Single):
+    async def reset(self):
+        self.chunks = 0
+
+
+class GeneratorClose(Single):
+    def close(self):
+        yield
+
+
 class NeedsMore:
     def __init__(self, weights):
         pass
@@ -359,6 +369,8 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
         ("ContractFails", {}, r"making it failed: ZeroDivisionError: .*\(.*mine\.py:\d+\)"),
         ("PredictFails", {}, "making it failed: ZeroDivisionError"),
         ("CloseIsMissing", {}, "failed to close: ZeroDivisionError"),
+        ("AsyncReset", {}, "reset is async or a generator: make it a plain method"),
+        ("GeneratorClose", {}, "close is async or a generator"),
         ("FailsInALibrary", {}, r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)"),
         ("NeedsMore", {}, r"cannot be made with Class\(\)"),
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
