@@ -280,13 +280,17 @@ def _flown_limits(folder: Path, contract: Contract) -> FreshnessLimits:
 
 
 def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
-    """Return the attitudes that reached the flight process; None if there is no such table.
+    """Return the attitudes that reached the flight process; None if no table tells.
 
     A sentence about any loss is appended to ``damage``.
     """
     if not table_exists(folder / PACKETS):
         return None
-    table = read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)
+    try:
+        table = read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)
+    except MavbridgeError as error:
+        damage.append(str(error))
+        return None
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
     if not len(rows):

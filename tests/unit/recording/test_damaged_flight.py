@@ -102,11 +102,13 @@ def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> 
 def test_inspect_says_so(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spoil_second_group(flight / "ticks.parquet")
     spoil_image(flight, 40)
+    (flight / "packets.parquet").write_bytes(b"something else")
     written = flight.parent / "inspect.json"
     assert inspect([flight], InspectConfig(json=written)) == 0
     (document,) = json.loads(written.read_text())
     for name in ("ticks.parquet", "camera.mp4"):
         assert any(f"{name} is damaged" in text for text in document["damage"])
+    assert any("packets.parquet cannot be read" in text for text in document["damage"])
     assert [moment["what"] for moment in document["moments"]] == ["rows lost"]
     assert "damage" in capsys.readouterr().out
 
