@@ -89,14 +89,18 @@ def read_rows(
     path = parquet if parquet.exists() else stream
     try:
         if path == stream:
-            return _read_batches(path, damage)
-        return _read_groups(path, damage, (*columns, *_LABELS))
+            table, numbers = _read_batches(path, damage)
+        else:
+            table, numbers = _read_groups(path, damage, (*columns, *_LABELS))
     except FileNotFoundError as error:
         raise DatasetError(
             f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
         ) from error
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(why_unreadable(path, error)) from error
+    if len(set(table.column_names)) < table.num_columns:
+        raise DatasetError(f"{path} has two columns of one name: record or convert it again")
+    return table, numbers
 
 
 def _read_batches(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
@@ -111,9 +112,15 @@ def _pointer(name: str) -> Spoil:
     return lambda flight: (flight / name).write_text("version https://git-lfs.github.com/spec/v1\n")
 
 
+def _one_column_twice(flight: Path) -> None:
+    table = pq.read_table(flight / "ticks.parquet")
+    pq.write_table(table.append_column("woke_ns", table["woke_ns"]), flight / "ticks.parquet")
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
+        (_one_column_twice, "ticks.parquet has two columns of one name"),
         (_without("meta.json"), "has no meta.json"),
         (_without("ticks.parquet"), "neither ticks.parquet nor ticks.arrows"),
         (_without("frames.parquet"), "lacks frames.parquet, though 10 frames were recorded"),
