@@ -44,6 +44,7 @@ from mavbridge.simulation.replay.compare import (
     compare_guard,
     compare_policy,
     forgotten,
+    losses,
     stick_traces,
 )
 from mavbridge.simulation.replay.guard import (
@@ -120,7 +121,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         told = forgotten(compared, has_reset=runner.reset is not keep_nothing)
         result = replace(result, gaps=(*result.gaps, *told))
     print_replay(result, table_console())
-    # JSON lacks infinity: only one of the two was flown.
+    # JSON lacks NaN, as of a chunk that was not finite.
     document = json.loads(json.dumps(as_document(result)), parse_constant=lambda _: None)
     write_json(config.json, document)
     if config.plot is not None:
@@ -289,9 +290,8 @@ class ReplayResult:
             found.append(f"the guard came out differently, first in the {self.guard.first}")
         if self.tolerance is None:
             return tuple(found)
+        found += losses(self.policy, self.sticks)
         if (policy := self.policy) is not None:
-            for name, count in policy.missing.items():
-                found.append(f"{count} solves were not repeated: {name}")
             for name, count in policy.inputs_differ.items():
                 if name not in PAST_INPUTS:
                     found.append(f"{count} solves were given another input: {name}")
@@ -328,7 +328,8 @@ def print_replay(result: ReplayResult, console: Console) -> None:
     console.print(make_table(title, header, rows, left_columns=2))
     recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
     console.print(recorded + (f", replayed on {result.engine}" if result.engine else ""))
-    for gap in result.gaps:
+    alone = losses(result.policy, result.sticks) if result.tolerance is None else ()
+    for gap in (*result.gaps, *alone):
         console.print(f"note: {gap}", style="yellow")
     past = result.policy.inputs_differ if result.policy and result.tolerance is not None else {}
     for name in filter(past.get, PAST_INPUTS):
@@ -361,12 +362,12 @@ def as_document(result: ReplayResult) -> dict[str, object]:
         "recorded_engine": result.source.meta.engine,
         "engine": result.engine,
         "tolerance": result.tolerance,
-        "is_equal": result.is_equal,
+        "is_equal": None if result.tolerance is None and result.is_equal else result.is_equal,
         "problems": result.problems,
         "gaps": result.gaps,
         "policy": None if result.policy is None else asdict(result.policy),
         "guard": asdict(result.guard),
-        "sticks": asdict(result.sticks.deviation),
+        "sticks": asdict(result.sticks.deviation) | {"flown_by_one": result.sticks.flown_by_one},
     }
 
 

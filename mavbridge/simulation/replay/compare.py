@@ -31,7 +31,7 @@ class Deviation:
 
     @property
     def most(self) -> float:
-        """Largest of all four; infinite if a row has no counterpart."""
+        """Largest of all four."""
         return max(self.largest)
 
 
@@ -76,11 +76,14 @@ class StickTraces:
 
     @property
     def deviation(self) -> Deviation:
-        """Deviation while either policy flew; infinite while only one did."""
+        """Deviation while both flew."""
         difference = np.abs(self.replayed - self.recorded)
-        both_idle = np.isnan(self.recorded) & np.isnan(self.replayed)
-        difference = np.where(np.isnan(difference) & ~both_idle, np.inf, difference)
-        return deviation_of(difference[~both_idle.any(axis=1)])
+        return deviation_of(difference[~np.isnan(difference).any(axis=1)])
+
+    @property
+    def flown_by_one(self) -> int:
+        """Number of ticks that only one of the two flew."""
+        return int((np.isnan(self.recorded) != np.isnan(self.replayed)).any(axis=1).sum())
 
 
 def deviation_of(difference: Array) -> Deviation:
@@ -121,6 +124,14 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
         equal_chunks=equal,
         deviation=deviation_of(np.concatenate([np.zeros((0, 4)), *differences])),
     )
+
+
+def losses(compared: PolicyComparison | None, sticks: StickTraces) -> Iterator[str]:
+    """Yield what was flown without a counterpart, in words."""
+    for name, count in compared.missing.items() if compared else ():
+        yield f"{count} solves were not repeated: {name}"
+    if count := sticks.flown_by_one:
+        yield f"{count} ticks were flown by one of the two alone, and are not compared"
 
 
 def forgotten(compared: PolicyComparison, *, has_reset: bool) -> Iterator[str]:

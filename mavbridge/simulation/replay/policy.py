@@ -176,7 +176,7 @@ class _News:
             return "the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
             if not shelf.bring(frame_id):
-                return "the feature of its image"
+                return "its image, or the feature of it"
         return None
 
     def _bring_ticks(self, now_ns: int) -> None:

@@ -23,6 +23,7 @@ from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.recording.folder import SETTINGS
 from mavbridge.simulation.replay.recording import open_source
+from policy.errors import NoChunkError
 
 NUMPY = FLIGHTS / "numpy_px4"
 B = Path("b.pt")
@@ -176,6 +177,32 @@ class Counting:
     def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
         self._calls += 1
         return np.full((1, 8, 4), 0.01 * self._calls % 0.3, np.float32)
+
+
+class Refusing(Counting):
+    """Has no more chunks after some."""
+
+    def predict_fast(self, feature: Any, state: Any, history: Any, steps: int) -> np.ndarray:
+        if self._calls > 100:
+            raise NoChunkError("lost the gate")
+        return super().predict_fast(feature, state, history, steps)
+
+
+def test_solves_and_ticks_without_a_counterpart_are_told_of_another_policy_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy, written = f"{__file__}:Refusing", tmp_path / "replay.json"
+    asked = ReplayConfig(policy=policy, source="features", json=written)
+
+    assert replay(NUMPY, asked) == ExitCode.DONE
+
+    shown = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"note: \d+ solves were not repeated: .*lost the gate", shown)
+    assert re.search(r"note: \d+ ticks were flown by one of the two alone", shown)
+    document = json.loads(written.read_text())
+    assert document["is_equal"] is None, "no agreement was expected"
+    assert document["sticks"]["flown_by_one"] > 0
+    assert all(isinstance(most, float) for most in document["sticks"]["largest"])
 
 
 def test_a_scripted_policy_begins_where_the_takeoff_ended(tmp_path: Path) -> None:
