@@ -298,8 +298,7 @@ class ReplayResult:
             other = policy.solves - policy.equal_chunks
             if other and self.tolerance == 0:
                 found.append(f"{other} of {policy.solves} chunks differ")
-        if self.sticks.deviation.most > self.tolerance:
-            most = self.sticks.deviation.most
+        if (most := self.sticks.deviation.most) > self.tolerance:
             found.append(f"a stick is off by {most:.4g}, more than {self.tolerance:g}")
         return tuple(found)
 

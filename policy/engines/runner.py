@@ -129,9 +129,20 @@ def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) ->
 
 
 def to_numpy(array: Any) -> FloatArray:
-    """Return a float32 copy of an array of any library, on any device."""
-    # numpy has no bfloat16.
-    return np.array(array.cpu().float().numpy() if hasattr(array, "cpu") else array, np.float32)
+    """Return a float32 copy of an array of any library, on any device.
+
+    Raises PolicyError unless it holds floats: numpy parses texts, and drops masks and imaginary
+    parts. V is the kind of bfloat16 there.
+    """
+    is_tensor = hasattr(array, "cpu")
+    is_float = array.is_floating_point() if is_tensor else array.dtype.kind in "fV"
+    if not is_float or np.ma.is_masked(array):
+        raise PolicyError(
+            f"{'an array' if not is_float else 'a masked array'} of {array.dtype}, and the "
+            "contract's numbers are floats: return the continuous actions"
+        )
+    # numpy has no bfloat16 of its own.
+    return np.array(array.cpu().float().numpy() if is_tensor else array, np.float32)
 
 
 def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:

@@ -122,7 +122,11 @@ def number_array(message: Message, key: str) -> NDArray[np.generic]:
         return np.asarray(value)
     try:
         # Without a dtype, each text of a list would take the room of the longest: terabytes.
-        return np.asarray(value, np.float64)
+        array = np.asarray(value, np.float64)
+        for each in np.asarray(value, object).flat:  # texts, None and booleans are converted
+            if isinstance(each, bool) or not isinstance(each, int | float | np.number):
+                raise TypeError(f"it holds {each!r:.60}")
+        return array
     except (TypeError, ValueError) as error:
         told = f"{type(value).__name__}: {last_line(error)}"
         raise MessageError(f"{key!r} is no array of numbers but {told}") from error

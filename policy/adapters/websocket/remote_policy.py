@@ -30,7 +30,7 @@ from policy.adapters.websocket.messages import (
     unpack,
 )
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.runner import level_state
+from policy.engines.runner import level_state, to_numpy
 from policy.errors import NoChunkError, PolicyError
 from policy.files import last_line
 
@@ -273,7 +273,7 @@ class RemotePolicy:
         self._has_begun = False  # not before: it may be the reset that failed
         try:
             return self._chunk(unpack(data))
-        except MessageError as error:
+        except PolicyError as error:
             raise NoChunkError(f"the policy server's answer is {error}") from error
 
     def reset(self) -> None:
@@ -311,4 +311,4 @@ class RemotePolicy:
                 f"actions {list(actions.shape)} where the contract has [horizon, 4] = "
                 f"{list(wanted)}: {advice}"
             )
-        return self._interface.to_actions(actions.astype(np.float32))[None]
+        return self._interface.to_actions(to_numpy(actions))[None]

@@ -1,3 +1,4 @@
+import re
 import sys
 import threading
 from collections.abc import Iterator
@@ -382,6 +383,27 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 def test_an_unusable_class_is_refused(mine, name, changes, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{mine}:{name}", **changes)
+
+
+@pytest.mark.parametrize(
+    ("chunk", "told"),
+    [
+        ("chunk.astype(np.int64)", "an array of int64, and the contract's numbers are floats"),
+        ("chunk > 0", "an array of bool"),
+        ("chunk + 1j", "an array of complex"),
+        ("chunk.astype(str)", "an array of <U"),
+        ("np.ma.masked_array(chunk, chunk == 0)", "a masked array of float32"),
+    ],
+)
+def test_a_chunk_that_numpy_would_convert_in_silence_is_refused(mine, folder, chunk, told):
+    (folder / "mine.py").write_text(f"""{MINE}
+class Odd(Single):
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        chunk = np.zeros((1, 16, 4), np.float32)
+        return {chunk}
+""")
+    with pytest.raises(PolicyError, match=re.escape(told)):
+        load(f"{mine}:Odd")
 
 
 @pytest.mark.parametrize("name", ["Observing", "Keeping"])

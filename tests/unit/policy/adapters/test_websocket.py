@@ -152,6 +152,10 @@ def test_errors_name_what_is_there() -> None:
         number_array({"actions": "left"}, "actions")
     with pytest.raises(MessageError, match="'actions' is no array"):
         number_array({"actions": [[1, 2], [3]]}, "actions")
+    for each in ("0.5", b"0.5", None, True):  # which numpy would convert
+        with pytest.raises(MessageError, match="'actions' is no array of numbers but list"):
+            number_array({"actions": [[0.5, each]]}, "actions")
+    assert number_array({"actions": [[1, 2.5]]}, "actions").tolist() == [[1.0, 2.5]]
     with pytest.raises(MessageError, match="'actions' is no array"):  # as texts of numpy: 2 TB
         number_array({"actions": ["a" * 700_000, *["b"] * 700_000]}, "actions")
     with pytest.raises(MessageError, match="KeyError: 'image'"):
