@@ -10,6 +10,8 @@ from functools import partial
 from inspect import isasyncgenfunction, iscoroutinefunction, isgeneratorfunction
 from pathlib import Path
 
+import numpy as np
+
 from policy.adapters.description import Description, OnnxFiles, find_onnx_files, read_description
 from policy.adapters.lerobot.plan import Plan, read_plan
 from policy.adapters.user_class import check_user_class, load_user_class
@@ -69,15 +71,16 @@ def check_request(request: PolicyRequest) -> Contract | None:
 
 
 @contextmanager
-def _folder_kept() -> Iterator[None]:
-    """Context manager: return to the working directory, which output files are relative to."""
+def _process_kept() -> Iterator[None]:
+    """Context manager: restore numpy's errors, and the folder that output files are relative to."""
     with ExitStack() as stack:
+        stack.enter_context(np.errstate())
         with suppress(OSError):  # it was deleted, or is closed to this user
             stack.enter_context(chdir(Path.cwd()))
         yield
 
 
-@_folder_kept()
+@_process_kept()
 def read_policy_contract(request: PolicyRequest) -> Contract:
     """Return the contract of a policy, without loading a built-in network."""
     contract = check_request(request)
@@ -91,7 +94,7 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
     return contract
 
 
-@_folder_kept()
+@_process_kept()
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
     """Find, load, try and time a policy; ``now_s`` (monotonic seconds) also drives programs."""
     check_request(request)

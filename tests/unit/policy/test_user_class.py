@@ -4,6 +4,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from helpers.loaded_policies import act, load
@@ -87,6 +88,13 @@ def test_a_policy_that_skips_the_dummy_image_is_loaded(folder: Path, dual_rate: 
     (folder / "skipping.py").write_text(SKIPPING)
     loaded = load("./skipping.py:Skipping", dual_rate=dual_rate)
     assert (loaded.runner.dual_rate, loaded.times) == (dual_rate, None)
+
+
+def test_a_policy_that_sets_how_numpy_fails_leaves_it_as_it_was(folder: Path) -> None:
+    code = FLYING.replace("self.value =", "np.seterr(all='raise'); self.value =")
+    (folder / "flying.py").write_text(code)
+    load("./flying.py:Flying")
+    assert np.exp(np.float32(-1000.0)) == 0.0
 
 
 def test_files_of_one_name_are_two_policies(folder: Path) -> None:
