@@ -11,7 +11,7 @@ from mavbridge.camera.grabber import wait_until_due
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.records import CameraImage, Frame
-from policy.files import library_name
+from policy.files import library_name, why_unreadable
 
 DEFAULT_FPS = 30.0
 """Frame rate for files with neither stamps nor a rate."""
@@ -51,7 +51,7 @@ class VideoFileCamera:
         """Next image; None at the end."""
         if self.upcoming is None:
             self._capture.release()
-            raise CameraError(f"{path} contains no video that can be decoded")
+            raise CameraError(why_unreadable(path, ValueError("no video that can be decoded")))
 
     def read(self, timeout_ns: int) -> Frame | None:
         """See `mavbridge.core.records.Camera`."""

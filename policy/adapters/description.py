@@ -115,11 +115,15 @@ def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
 
 def read_description(spec: str, path: Path, contract_file: Path | None) -> Description:
     """Read the description inside the archive of the policy ``spec``; takes milliseconds."""
+    names, data = [], None
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
-            data = archive.read(extra[0]) if extra else None
+        with path.open("rb") as file:
+            is_pickle = file.read(1) == b"\x80"  # also what torch.save wrote once
+        if not is_pickle:
+            with zipfile.ZipFile(path) as archive:
+                names = archive.namelist()
+                extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
+                data = archive.read(extra[0]) if extra else None
     except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
         raise CheckpointError(f"--policy {spec}: {why_unreadable(path, error)}") from error
     if not any("/code/" in name for name in names):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from ssl import SSLError
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -217,8 +218,11 @@ class ServerLink:
                 return f"{self._url} is no policy server, its first message is {error}"
             case ConnectionRefusedError():
                 return f"nobody listens at {self._url}: start the policy server there"
+            case SSLError() | ConnectionResetError() if self._url.startswith("wss:"):
+                told = last_line(error)
+                return f"{self._url} cannot be reached by TLS ({told}): write ws:// if it has none"
             case OSError():
-                return f"{self._url} cannot be reached: {error.strerror or error}"
+                return f"{self._url} cannot be reached: {error.strerror or last_line(error)}"
             case _:
                 return str(error)
 

@@ -54,6 +54,9 @@ def test_a_file_that_is_no_video_is_refused(tmp_path, clock):
     path.write_text("not a video")
     with pytest.raises(CameraError, match="no video that can be decoded"):
         VideoFileCamera(path, clock=clock)
+    path.write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(CameraError, match="is a pointer of Git LFS, not the file"):
+        VideoFileCamera(path, clock=clock)
     with pytest.raises(PolicyError, match="is not UTF-8: rename it"):
         VideoFileCamera(path.rename(tmp_path / "caf\udce9.mp4"), clock=clock)
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import pickle
 import zipfile
 from pathlib import Path
 
@@ -213,6 +214,7 @@ def zipped(description: bytes) -> bytes:
         (b"junk", "cannot be read"),
         (b"", "is empty, or cut short"),
         (weights(), "is not a TorchScript archive"),
+        (pickle.dumps({"weights": 1}), "is not a TorchScript archive"),
         (zipped(b"\xef\xbb\xbf{}"), "nothing says at which rate"),
         (zipped("{}".encode("utf-16")), "policy.json cannot be read: it is text in UTF-16"),
     ],

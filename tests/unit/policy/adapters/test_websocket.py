@@ -2,6 +2,7 @@
 
 import importlib.util
 import pickle
+import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from policy.adapters.websocket.messages import (
     to_uint8,
     unpack,
 )
+from policy.adapters.websocket.remote_policy import ServerLink
 from policy.contract import Contract
 from policy.errors import MavbridgeError, PolicyError
 from policy.loading.load import check_request
@@ -252,3 +254,14 @@ def test_a_request_that_does_not_fit_is_refused(changes: dict[str, Any], told: s
     message = {key: value for key, value in message.items() if value is not None}
     with pytest.raises(MessageError, match=told):
         from_message(interface, message)
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("wss://host:1", r"by TLS \(ConnectionResetError\): write ws://"),
+        ("ws://host:1", "cannot be reached: ConnectionResetError"),
+    ],
+)
+def test_an_error_without_words_is_told_by_its_kind(url: str, told: str) -> None:
+    assert re.search(told, ServerLink(url, api_key=None)._reason(ConnectionResetError()))
