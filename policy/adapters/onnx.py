@@ -14,7 +14,7 @@ import openvino as ov
 from policy.adapters.description import USUAL_NAMES, OnnxFiles, read_graph
 from policy.adapters.modules import DenoiserPolicy, ForwardPolicy, HeadPolicy, make_schedule
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.choose import chunks_of_samples, first_with_chunks, make_parity_samples
+from policy.engines.choose import fastest_like
 from policy.engines.openvino_compile import (
     Graph,
     compile_graph,
@@ -359,16 +359,12 @@ class OnnxGraphs:
             )
             return replace(runner, reset=reset) if self._rest.hidden else runner
 
-        reference, samples = runner_of("f32", "f32"), make_parity_samples(self.interface.contract)
         faster = [
             (engine_name(*pair), partial(runner_of, *pair))
             for pair in precisions()
             if pair != ("f32", "f32")
         ]
-        runner, notes = first_with_chunks(chunks_of_samples(reference, samples), samples, faster)
-        if runner is not None:
-            return runner, (*notes, f"engine {runner.engine}: agrees with float32")
-        return reference, (*notes, f"engine {reference.engine}")
+        return fastest_like(runner_of("f32", "f32"), faster)
 
 
 def _with_feature(contract: Contract, encoder: GraphFile, path: Path) -> Contract:

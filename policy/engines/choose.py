@@ -38,6 +38,10 @@ MIN_COSINE = 0.999
 MAX_STICK_ERROR = 0.01
 """Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
 SAMPLES = 4
+_NOT_REPEATED = (
+    "the same inputs do not give the same chunk again, so it draws random numbers, or keeps "
+    "something from call to call"
+)
 Candidate = tuple[str, Callable[[], PolicyRunner]]
 """Name of an engine to try, and the function that creates its runner.
 
@@ -147,8 +151,8 @@ def first_that_agrees(
         except NoChunkError as error:
             note = f"engine torch: it has no chunk for a sample, which a graph cannot say: {error}"
             return make_torch_runner(policy, settings), (note,)
-        if (reason := _impurity(policy, before, reference, samples, expected)) is not None:
-            return make_torch_runner(policy, settings), (f"engine torch: {reason}",)
+        if (impure := _impurity(policy, before, reference, samples, expected)) is not None:
+            return make_torch_runner(policy, settings), (impure,)
         runner, notes = first_with_chunks(expected, samples, candidates)
         if runner is not None:
             return runner, (*notes, Agreed(f"engine {runner.engine}: agrees with torch"))
@@ -173,6 +177,20 @@ def first_with_chunks(
     return None, tuple(notes)
 
 
+def fastest_like(
+    reference: PolicyRunner, faster: Sequence[Candidate]
+) -> tuple[PolicyRunner, tuple[str, ...]]:
+    """Return the first candidate with the chunks of a float32 runner, else that; and notes."""
+    samples = make_parity_samples(reference.contract)
+    expected = chunks_of_samples(reference, samples)
+    if not np.array_equal(chunks_of_samples(reference, samples), expected, equal_nan=True):
+        return reference, (warned(f"engine {reference.engine}: {_NOT_REPEATED}"),)
+    runner, notes = first_with_chunks(expected, samples, faster)
+    if runner is not None:
+        return runner, (*notes, f"engine {runner.engine}: agrees with float32")
+    return reference, (*notes, f"engine {reference.engine}")
+
+
 def chunks_of_samples(runner: PolicyRunner, samples: ParitySamples) -> FloatArray:
     """Return chunks [samples, horizon, 4] of the whole path from image to stick, after a reset."""
     runner.reset()
@@ -189,19 +207,17 @@ def _impurity(
     samples: ParitySamples,
     expected: FloatArray,
 ) -> str | None:
-    """Return why no graph can compute this policy; None if one may."""
+    """Return a note on why no graph can compute this policy; None if one may."""
     if isinstance(policy, BuiltinPolicy):
         return None
     if changed := changes(before, snapshot(policy)):
-        return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
+        kept = ", ".join(changed)
+        return f"engine torch: it keeps {kept} from call to call, which a graph cannot"
     encoded = encode_all(reference, samples.rgb[0])
     again = reference.act(encoded, samples.state[:1], samples.history[:1])[0]
     if np.array_equal(again, expected[0]):
         return None
-    return (
-        "the same inputs do not give the same chunk again, so it draws random numbers, or keeps "
-        "something from call to call, which a graph cannot"
-    )
+    return warned(f"engine torch: {_NOT_REPEATED}")
 
 
 def _candidates(

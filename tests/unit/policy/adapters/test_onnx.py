@@ -29,7 +29,7 @@ from policy.adapters.onnx import GraphFile, Wanted
 from policy.engines import choose
 from policy.engines.runner import ExecutionSettings, dummy_sample
 from policy.engines.torch_engines import make_torch_runner
-from policy.errors import PolicyError
+from policy.errors import PolicyError, Warned
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.toge import Toge
@@ -82,6 +82,21 @@ def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
     loaded = load(f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
     assert "mine.onnx" in "".join(loaded.notes)
     require_same(loaded.runner, load("helpers.torch_policies:ForwardOnly", dual_rate=False).runner)
+
+
+class Drawing(nn.Module):
+    def forward(self, image: Tensor, state: Tensor) -> Tensor:
+        return 0.1 * torch.randn(1, 8, 4) + 0 * (image.sum() + state.sum())
+
+
+def test_a_graph_that_draws_random_numbers_is_warned_of(tmp_path: Path) -> None:
+    write(Drawing(), tmp_path / "mine.onnx", {"image": IMAGE, "state": STATE})
+    (tmp_path / "mavbridge.toml").write_text(
+        "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
+    )
+    loaded = load(f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
+    (warning,) = [note for note in loaded.notes if isinstance(note, Warned)]
+    assert warning.text.startswith("engine openvino-f32: the same inputs do not give")
 
 
 @pytest.mark.parametrize("axes", [(), (1, 1)])
