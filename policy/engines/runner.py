@@ -267,11 +267,8 @@ def _try(runner: PolicyRunner) -> None:
 
 
 def require_chunk(runner: PolicyRunner, chunk: FloatArray) -> None:
-    """Raise NoChunkError if a flight could not use a chunk of a dummy sample."""
-    try:
-        _require(runner, "the chunk", chunk, (1, runner.contract.horizon, ACTION_DIM))
-    except PolicyError as error:
-        raise NoChunkError(str(error)) from None
+    """Raise PolicyError if a flight could not use a chunk of a dummy sample."""
+    _require(runner, "the chunk", chunk, (1, runner.contract.horizon, ACTION_DIM))
 
 
 def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:

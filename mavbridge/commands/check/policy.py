@@ -18,7 +18,7 @@ from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.engines.runner import dummy_sample, encode_all, require_chunk
-from policy.errors import Agreed, NoChunkError, Warned
+from policy.errors import Agreed, NoChunkError, PolicyError, Warned
 from policy.loading.request import LoadedPolicy
 from policy.protocol import PolicyRunner
 
@@ -80,8 +80,11 @@ def _speed_rows(
     plan: FlightPlan, loaded: LoadedPolicy, clock: Clock, timing_s: float
 ) -> Iterator[CheckRow]:
     """Yield rows on the held rates, and the flight's warnings about the policy's speed."""
-    for pace in _run_at_rates(plan, loaded.runner, clock, timing_s):
-        yield pace.row()
+    try:
+        for pace in _run_at_rates(plan, loaded.runner, clock, timing_s):
+            yield pace.row(had_chunks=loaded.times is not None)
+    except NoChunkError as error:
+        yield _row("speed", "not measured", warn=f"it skips the dummy image: {error}")
     expected = "within the ages of its contract"
     try:
         notes = require_speed(plan, loaded.runner.name, loaded.times)
@@ -131,8 +134,11 @@ class Pace:
             ended_ns, due_ns = now_ns, max(due_ns + every_ns, now_ns)
         self.rate_hz = self.took.count * NS_PER_S / max(due_ns - begun_ns, 1)
 
-    def row(self) -> CheckRow:
-        """Return a row with rate and times; a warning if the rate was not held, or only just."""
+    def row(self, *, had_chunks: bool = True) -> CheckRow:
+        """Return a row with rate and times; a warning if the rate was not held, or only just.
+
+        ``had_chunks``: the policy had a chunk for the dummy sample, so it must have them here.
+        """
         took_ms = self.took.percentiles_ms()
         if took_ms is None:
             return _row(self.name, "not one in time", warn="far too slow for this computer")
@@ -151,7 +157,7 @@ class Pace:
             f"{share:.0%} of a slot",
             expected,
             warn=advice,
-            no_go=advice if 2 * self.failed > calls else "",
+            no_go=advice if had_chunks and 2 * self.failed > calls else "",
         )
 
 
@@ -164,6 +170,13 @@ def _run_at_rates(
     sample = encode_all(runner, images), state, history
     one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
 
+    def solve() -> None:
+        chunk = runner.act(*sample)
+        try:
+            require_chunk(runner, chunk)
+        except PolicyError as error:  # a flight refuses it
+            raise NoChunkError(str(error)) from None
+
     def encode() -> None:
         for camera, image in enumerate(one_of_each):
             runner.encode(image, camera)
@@ -172,7 +185,7 @@ def _run_at_rates(
     pictures = Pace(name="images", asked_hz=min(plan.image_rates_hz))
     workers = []
     for pace, call, is_realtime in (
-        (chunks, lambda: require_chunk(runner, runner.act(*sample)), plan.config.rates.realtime),
+        (chunks, solve, plan.config.rates.realtime),
         (pictures, encode, False),
     ):
         settle: Callable[[], object] = settle_thread if is_realtime else lambda: None

@@ -107,7 +107,7 @@ def test_a_pace_that_is_not_held_is_a_warning(
     ("good", "chunk", "verdict", "told"),
     [
         pytest.param(7, "raise NoChunkError('warming up')", "no-go", "warming up", id="later"),
-        pytest.param(0, "raise NoChunkError('warming up')", "no-go", "warming up", id="never"),
+        pytest.param(0, "raise NoChunkError('it is dark')", "warn", "it is dark", id="never"),
         pytest.param(7, "return chunk * np.nan", "no-go", "NaN", id="NaN"),
         pytest.param(7, "return chunk[:, :2]", "no-go", "[1, 2, 4]", id="shape"),
         pytest.param(
@@ -135,6 +135,22 @@ class Later:
     row = next(row for row in rows if row.name == "chunks")
     assert row.verdict == verdict
     assert told in row.advice
+
+
+def test_a_policy_that_skips_the_dummy_image_is_not_measured(tmp_path: Path) -> None:
+    (file := tmp_path / "skips.py").write_text("""\
+from policy.contract import Contract
+from policy.errors import NoChunkError
+class Skips:
+    contract = Contract(arrays="numpy", feature_dim=8, image_height=32, image_width=32)
+    def encode_visual(self, image):
+        raise NoChunkError("no contrast")
+    def predict_fast(self, feature, state, action_history, num_diffusion_steps):
+        raise AssertionError
+""")
+    rows, _ = check_policy(flight(f"{file}:Skips"), MonotonicClock(), timing_s=0.5)
+    (row,) = (row for row in rows if row.name == "speed")
+    assert (row.verdict, row.advice) == ("warn", "it skips the dummy image: no contrast")
 
 
 @pytest.mark.parametrize("width", [80, 160])
