@@ -153,7 +153,7 @@ def test_a_killed_writer_costs_the_images_and_not_the_outcome(tmp_path: Path) ->
         assert flying.end()[0] in ORDERLY
     meta = open_flight(folder).meta
     assert (meta.finished, meta.outcome is None, bool(meta.parameters)) == (False, False, True)
-    assert "images lost" in str(meta.loss)
+    assert "images and packets lost" in str(meta.loss)
 
 
 def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
