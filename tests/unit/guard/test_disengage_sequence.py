@@ -496,6 +496,15 @@ def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
     assert stepped.step(mode_arrived_ns=until_ns + 1).mode == "BRAKE"
 
 
+def test_a_command_that_failed_delays_only_its_own_way_out() -> None:
+    sequence, asked = DisengageSequence(engagement_settings()), []
+    for command_failed in (True, False):
+        sequence.begin(PX4, is_fault=True)
+        facts = altered(PX4, now_ns=PX4.now_ns + NS_PER_MS, command_failed=command_failed)
+        asked.append(sequence.step(facts, None).mode)
+    assert asked == [None, "AUTO.LOITER"]
+
+
 def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
     stepped = at_fault(IDLE_RECEIVER)
     silence(stepped, 10)
