@@ -83,6 +83,8 @@ class GuardProcess:
         """Final summary; None until the guard has ended in order."""
         self.tlog_pipe: TlogPipe | None = None
         """Telemetry log of a flight that is recorded."""
+        self.wall_offset_ns = settings.wall_offset_ns
+        """Offset from the clock to the Unix time of the log's stamps."""
         self.error: MavbridgeError | None = None
         """Error that ended the guard."""
         self.is_stuck = False

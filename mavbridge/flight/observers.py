@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import as_json
@@ -121,7 +121,6 @@ class FlightObservers:
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
-        self._wall_offset_ns = wall_offset_ns(clock)
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
@@ -154,7 +153,7 @@ class FlightObservers:
         from mavbridge.recording.replay_files import ReplaySettings
 
         meta = replace(
-            flight_meta(self._plan, "flight", self._clock.now_ns(), self._wall_offset_ns),
+            flight_meta(self._plan, "flight", self._clock.now_ns(), guard.wall_offset_ns),
             policy=self._runner.name,
             engine=self._runner.engine,
             seed=self._config.policy.seed,
@@ -170,7 +169,7 @@ class FlightObservers:
                 packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
                 autopilot=autopilot,
                 report=self.screen.show_message,
-                settings=ReplaySettings(config=self._config, wall_offset_ns=self._wall_offset_ns),
+                settings=ReplaySettings(config=self._config, wall_offset_ns=guard.wall_offset_ns),
             )
         except OSError as error:
             raise UserError(f"--record {self._config.record}: {error}") from error

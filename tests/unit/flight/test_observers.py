@@ -2,6 +2,8 @@
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.plan import plan_flight
 from mavbridge.guard.wire import GuardStatus
+from mavbridge.recording import recorder
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 
@@ -26,10 +29,10 @@ class Hovering:
         return np.zeros((1, self.contract.horizon, 4), np.float32)
 
 
-def observers(report: Path, said: io.StringIO) -> FlightObservers:
+def observers(report: Path, said: io.StringIO, *, record: Path | None = None) -> FlightObservers:
     runner = make_numpy_runner(Hovering(), ExecutionSettings(name="hovering", dual_rate=False))
     console = Console(file=said, width=200)
-    plan = plan_flight(FlyConfig(report=report), runner.contract, is_dual=False)
+    plan = plan_flight(FlyConfig(report=report, record=record), runner.contract, is_dual=False)
     return FlightObservers(plan, runner, clock=FakeClock(), console=console)
 
 
@@ -61,3 +64,17 @@ def test_the_terminal_is_given_back_even_if_the_report_fails(
     with pytest.raises(RuntimeError, match="a bug"):
         watching.finish(None, "ardupilot", None)
     assert closed
+
+
+def test_the_stamps_of_a_recording_have_the_wall_time_of_its_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The guard starts before the weights load; wall time may step until the recorder does."""
+    begun: dict[str, Any] = {}
+    stub = SimpleNamespace(begin=lambda _folder, meta, **rest: begun.update(rest, meta=meta))
+    monkeypatch.setattr(recorder, "Recorder", lambda **_: stub)
+    guard: Any = SimpleNamespace(tlog_pipe=object(), wall_offset_ns=1_700_000_000 * 10**9)
+    watching = observers(tmp_path / "report.json", io.StringIO(), record=tmp_path / "flight")
+    watching.open_recorder(guard, lambda: "ArduPilot")
+    assert begun["settings"].wall_offset_ns == guard.wall_offset_ns
+    assert begun["meta"].started_at.startswith("2023-11-14T22:")
