@@ -14,7 +14,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
 from mavbridge.flight.outcome import RUN_OUT_NS, Standstill
 from policy.contract import ACTION_DIM
-from sitl.course import make_course
+from sitl.course import GatePass, make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.rotation import Vec3
 
@@ -144,6 +144,8 @@ class Referee:
         self._outcome: Outcome | None = None
         self._end_ns = 0
         self._distance_m = 0.0
+        self._gates_passed: tuple[GatePass, ...] = ()
+        self._drift_m: float | None = None
         self.stop = threading.Event()
 
     def emit(self, event: Event) -> None:
@@ -169,7 +171,10 @@ class Referee:
         is_interrupted = self._should_stop is not None and self._should_stop()
         if self._outcome is not None or self._has_failed_to_engage or is_interrupted:
             self._end_ns = self._clock.now_ns()
-            self._distance_m = self._vehicle.log.distance_m
+            self._distance_m, self._gates_passed = log.distance_m, log.gates_passed
+            if (stopped_ned_m := self._stopped_ned_m) is not None:
+                end_ned_m = self._vehicle.ap.truth.position_ned_m
+                self._drift_m = math.dist(stopped_ned_m[:2], end_ned_m[:2])
             self.stop.set()
 
     @property
@@ -207,22 +212,19 @@ class Referee:
             raise PeerError(
                 f"the policy did not get the sticks within {READY_NS // NS_PER_S} s: {reason}"
             )
-        engaged_ns, log = self._meter.engaged_ns, self._vehicle.log
+        engaged_ns = self._meter.engaged_ns
         if self._outcome is None or engaged_ns is None:
             raise EpisodeInterruptedError(f"course {course_seed}: interrupted")
-        drift_m, stopped_ned_m = None, self._stopped_ned_m
-        if stopped_ned_m is not None:
-            drift_m = math.dist(stopped_ned_m[:2], self._vehicle.ap.truth.position_ned_m[:2])
         offset_s = (engaged_ns - self._start_ns) / NS_PER_S
         return EpisodeResult(
             course_seed=course_seed,
             seed=seed,
             outcome=self._outcome,
-            gates_total=log.gates_total,
-            gate_times_s=tuple(gate.t_s - offset_s for gate in log.gates_passed),
+            gates_total=self._vehicle.log.gates_total,
+            gate_times_s=tuple(gate.t_s - offset_s for gate in self._gates_passed),
             flown_s=(self._end_ns - engaged_ns) / NS_PER_S,
             distance_m=self._distance_m,
             stick_rate_per_s=self._meter.rate_per_s,
             lost=self._lost,
-            drift_m=drift_m,
+            drift_m=self._drift_m,
         )
