@@ -48,7 +48,7 @@ class FlightLog:
         self._armed_ns = 0
         self._last_ns = self._path_due_ns = start_ns
         self._max_altitude_m = self._speed_mps = self._impact_mps = 0.0
-        self._path_point_ned_m: Vec3 = (0.0, 0.0, 0.0)
+        self._path_point_ned_m: Vec3 | None = None
         self._position_ned_m: Vec3 | None = None
         self._was_touching = True
 
@@ -72,14 +72,14 @@ class FlightLog:
     def start_over(self, next_gate: int) -> None:
         """Restart the count at ``next_gate`` after the vehicle was placed elsewhere in the air."""
         self._gates = GateCounter(self._course, first=next_gate)
-        self._position_ned_m = None
+        self._position_ned_m = self._path_point_ned_m = None
         self._was_touching = False
         self.crash = None
 
     def on_reboot(self) -> None:
         """Start a new trajectory at the origin, which the vehicle did not fly to."""
         self._gates.interrupt()
-        self._position_ned_m = None
+        self._position_ned_m = self._path_point_ned_m = None
         self._was_touching = True
 
     def verdict(
@@ -117,7 +117,8 @@ class FlightLog:
         self._max_altitude_m = max(self._max_altitude_m, -body.position_ned_m[2])
         if ap.now_ns >= self._path_due_ns:
             self._path_due_ns = ap.now_ns + PATH_PERIOD_NS
-            self.distance_m += math.dist(body.position_ned_m, self._path_point_ned_m)
+            before_ned_m = self._path_point_ned_m or body.position_ned_m
+            self.distance_m += math.dist(body.position_ned_m, before_ned_m)
             self._path_point_ned_m = body.position_ned_m
         self._check_gates(body.position_ned_m, ap.now_ns)
         if body.touching and not self._was_touching:

@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.course import AirborneStart
 from sitl.report import FlightLog
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
@@ -59,3 +60,22 @@ def test_after_a_stall_a_stick_is_not_recorded_before_it_came():
     vehicle.step(301 * NS_PER_MS)
     changed = vehicle.log.summary(vehicle.ap)["sticks"][1]
     assert (changed["us"][0], changed["t_s"]) == (1700, 0.3)
+
+
+def test_a_vehicle_that_is_put_elsewhere_has_not_flown_there():
+    vehicle = SimulatedVehicle(links=1, boot_ns=0)
+    far_ned_m = (30.0, 40.0, -5.0)
+    vehicle.launch(
+        AirborneStart(
+            position_ned_m=far_ned_m,
+            velocity_ned_mps=(0.0, 0.0, 0.0),
+            ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+            next_gate=0,
+        )
+    )
+    vehicle.step(NS_PER_S // 10)
+    assert vehicle.ap.truth.position_ned_m == pytest.approx(far_ned_m, abs=0.5)
+    vehicle.reboot()
+    vehicle.step(NS_PER_S // 5)
+    assert vehicle.ap.truth.position_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.5)
+    assert vehicle.log.distance_m < 0.5
