@@ -15,6 +15,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.recorder import Recorder
+from mavbridge.recording.video_process import MAX_SLOTS
 from mavbridge.recording.video_writer import WriterDiedError
 
 PACKET = bytes(20)
@@ -89,6 +90,7 @@ def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
 def test_what_comes_while_the_writer_starts_is_recorded(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of the images the newest: a hole behind the first of them would cut the episode in two."""
     begin = Recorder.begin
 
     def begin_late(*args: object, **kwargs: object) -> None:
@@ -104,7 +106,9 @@ def test_what_comes_while_the_writer_starts_is_recorded(
     stand.episodes.end("a key")
     flight = stand.flight(1)
     assert [row.tick.index for row in flight.tick_rows()] == list(range(100, 141))
-    assert next(flight.frame_rows()).frame_id == make_frame(100).frame_id
+    frame_ids = [row.frame_id for row in flight.frame_rows()]
+    assert frame_ids == [make_frame(number).frame_id for number in range(140 - MAX_SLOTS // 2, 141)]
+    assert flight.meta.frames_dropped == 0
 
 
 @pytest.mark.parametrize(("mark", "success"), [("good", True), ("bad", False)])
