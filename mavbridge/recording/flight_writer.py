@@ -1,6 +1,8 @@
 """Single-threaded writer of a flight's folder: tables, videos and meta."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -60,7 +62,7 @@ class _Camera:
 class FlightWriter:
     """Writer used during the flight; ``finish`` closes the files in order.
 
-    Methods raise OSError or WriterError if a file cannot be written. Afterwards only ``finish`` and
+    Methods raise WriterError if a file cannot be written. Afterwards only ``finish`` and
     ``close`` are allowed; everything written before stays readable.
     """
 
@@ -92,10 +94,11 @@ class FlightWriter:
         """Packets in order of arrival; filled by another thread."""
         self._packet_serials, self._packets_dropped = SerialNumbers(), 0
         try:
-            self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
-            write_meta(folder, meta)
-            self._open_tables(with_labels=with_labels, with_replay=with_replay)
-        except (OSError, WriterError):
+            with self._writing():
+                self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
+                write_meta(folder, meta)
+                self._open_tables(with_labels=with_labels, with_replay=with_replay)
+        except WriterError:
             self.close()
             raise
 
@@ -173,6 +176,15 @@ class FlightWriter:
             self._flushed_ns = now_ns
             self.flush()
 
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Context manager: raise WriterError for an OSError."""
+        try:
+            yield
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno else error
+            raise WriterError(f"{self._folder} cannot be written: {reason}") from error
+
     def flush(self) -> None:
         """Hand all rows to the kernel."""
         if self._packets is not None:
@@ -180,8 +192,9 @@ class FlightWriter:
                 skipped = self._packet_serials.take(self._packets.rows + self._packets_dropped)
                 self._packets.add(replay_files.packet_columns(packet, skipped))
             self._packets_dropped = self.packets.dropped  # behind those: the queue was full
-        for table in self._tables:
-            table.flush()
+        with self._writing():
+            for table in self._tables:
+                table.flush()
 
     @property
     def misfit(self) -> str | None:
@@ -206,8 +219,9 @@ class FlightWriter:
         """
         try:
             self.flush()
-            for table in self._tables:
-                table.finish()
+            with self._writing():
+                for table in self._tables:
+                    table.finish()
             for camera in self._cameras:
                 self._act(camera, lambda video: video.finish())
         except BaseException:
@@ -222,7 +236,8 @@ class FlightWriter:
             ticks_dropped=self._serials.dropped,
             frames_dropped=sum(each.serials.next - each.video.written for each in self._cameras),
         )
-        write_meta(self._folder, self.meta)
+        with self._writing():
+            write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""

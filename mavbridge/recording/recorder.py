@@ -115,7 +115,7 @@ class Recorder(ObserverThread):
 
 @dataclass
 class _FlightConsumer:
-    """Consumer on the recorder's thread; can raise OSError and WriterError."""
+    """Consumer on the recorder's thread; can raise WriterError."""
 
     writer: FlightWriter
     packets_dropped: Callable[[], int]

@@ -1,6 +1,7 @@
 """Flights to record: images that show their number, a meta, and a writer without a process."""
 
 import os
+import resource
 import signal
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -109,6 +110,17 @@ def without_writer_process() -> Iterator[None]:
     """Context manager: write flights in the calling thread."""
     with patch.object(flight_writer, "VideoWriter", InProcessWriter):
         yield
+
+
+@contextmanager
+def disk_of(limit_bytes: int) -> Iterator[None]:
+    """No file of this process grows beyond that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def send_signal(pid: int, number: signal.Signals) -> None:

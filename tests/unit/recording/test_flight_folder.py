@@ -9,13 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
-from helpers.recordings import make_frame, make_meta, number_of, write_recording
+from helpers.recordings import disk_of, make_frame, make_meta, number_of, write_recording
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import FlightError, prepare_folder, read_meta, write_meta
+from mavbridge.recording.video_writer import WriterError
 from policy.contract import Contract
 
 
@@ -223,3 +224,19 @@ def test_the_outcome_is_kept_as_numbers_and_codes(tmp_path: Path) -> None:
     assert written["success"] is False, "three gates are missing"
     assert read_meta(tmp_path).outcome == OUTCOME
     assert make_meta(success=True).with_outcome(OUTCOME).success is True, "somebody has said so"
+
+
+@pytest.mark.parametrize(
+    ("room", "ticks", "readable"),
+    [(10, 3, None), (12_000, 60, 0), (5_000, 3, 0), (9_000, 3, 3)],
+    ids=["meta", "flush", "last flush", "parquet"],
+)
+def test_a_full_disk_is_told_wherever_it_is_met(
+    tmp_path: Path, room: int, ticks: int, readable: int | None
+) -> None:
+    told = pytest.raises(WriterError, match="flight cannot be written: File too large")
+    with disk_of(room), told:
+        write_recording(tmp_path / "flight", [make_tick(number) for number in range(ticks)])
+    if readable is not None:
+        flight = open_flight(tmp_path / "flight")
+        assert (flight.meta.finished, flight.ticks.num_rows) == (False, readable)

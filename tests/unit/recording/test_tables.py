@@ -1,6 +1,3 @@
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.recordings import make_row
+from helpers.recordings import disk_of, make_row
 from mavbridge.recording.rows import FRAMES, TICKS, frame_columns
 from mavbridge.recording.tables import TableWriter, read_table
 from policy.data.flight_data import DatasetError
@@ -29,17 +26,6 @@ def add(writer: TableWriter, count: int) -> None:
     for _ in range(count):
         writer.add(frame_columns(make_row(writer.rows)))
     writer.flush()
-
-
-@contextmanager
-def disk_of(limit_bytes: int) -> Iterator[None]:
-    """No file of this process grows beyond that."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @settings(max_examples=40)
