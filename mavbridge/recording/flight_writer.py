@@ -196,6 +196,12 @@ class FlightWriter:
             for table in self._tables:
                 table.flush()
 
+    def describe(self, meta: FlightMeta) -> None:
+        """Replace ``meta.json``."""
+        self.meta = meta
+        with self._writing():
+            write_meta(self._folder, meta)
+
     @property
     def misfit(self) -> str | None:
         """Why a frame was dropped that its video cannot have; None if there was none."""
@@ -228,16 +234,17 @@ class FlightWriter:
             self.close()
             raise
         is_whole = self.video_failure is None
-        self.meta = replace(
-            meta,
-            finished=is_whole,
-            ticks=self._ticks.rows,
-            frames=self._cameras[0].video.written if is_whole else None,
-            ticks_dropped=self._serials.dropped,
-            frames_dropped=sum(each.serials.next - each.video.written for each in self._cameras),
+        written = [each.video.written for each in self._cameras]
+        self.describe(
+            replace(
+                meta,
+                finished=is_whole,
+                ticks=self._ticks.rows,
+                frames=written[0] if is_whole else None,
+                ticks_dropped=self._serials.dropped,
+                frames_dropped=sum(each.serials.next for each in self._cameras) - sum(written),
+            )
         )
-        with self._writing():
-            write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""

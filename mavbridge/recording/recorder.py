@@ -134,6 +134,7 @@ class _FlightConsumer:
         """Write one batch."""
         seen_frames = self._seen_frames
         try:
+            self._note_autopilot(batch[0])
             for event in batch:
                 if isinstance(event, Tick):
                     self.crash_watch.see(event)
@@ -146,6 +147,12 @@ class _FlightConsumer:
             self._has_failed = True
             self._seen_frames = seen_frames  # the observer counts the whole batch as lost
             raise
+
+    def _note_autopilot(self, event: Observed) -> None:
+        """Complete ``meta.json`` once the vehicle is known, for a flight that is cut off."""
+        meta = self.writer.meta
+        if isinstance(event, Tick) and event.mode and (name := self.autopilot()) != meta.autopilot:
+            self.writer.describe(replace(meta, autopilot=name))
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1

@@ -12,7 +12,7 @@ from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import remove_flight
+from mavbridge.recording.folder import read_meta, remove_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 
@@ -57,6 +57,7 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
         for _ in range(3_000):
             if stood.recorder._flight.writer.ticks < 10:  # the thread has not taken them yet
                 stood.recorder._closing.wait(0.01)
+        assert read_meta(tmp_path).autopilot == "ardupilot 4.6.0", "known if it is cut off now"
         send_signal(stood.pid, signal.SIGKILL)
         stood.emit(range(10, 40), range(10, 20))
         stood.recorder.meta = replace(stood.recorder.meta, parameters={"RC_SPEED": 490.0})
