@@ -100,6 +100,7 @@ FAILSAFE_MODES = {
     "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
 }
 """Mode that each value of the parameter selects; all other values but 0 mean RTL."""
+LAND_DELAY_NS = 4 * NS_PER_S  # LAND_WITH_DELAY_MS: time for the pilot to take over
 FS_OPTION_GUIDED = 4  # GUIDED continues without the pilot's sticks
 FS_OPTION_LANDING_CONTINUES = 8
 FS_OPTION_PILOT_CONTINUES = 16
@@ -365,4 +366,7 @@ class ArduCopter(Autopilot):
         if not self.armed:
             return
         mode = FAILSAFE_MODES[parameter].get(self.params.integer(parameter), Mode.RTL)
+        before = self.mode
         self.set_mode(mode if self.position_ready else Mode.LAND)
+        if self.mode is Mode.LAND is not before:
+            self.control.sinks_from_ns = self.now_ns + LAND_DELAY_NS

@@ -82,6 +82,8 @@ class CopterControl:
         self._home_reached = False
         self._hold_m: complex | None = None  # north + 1j * east
         self.guided = GuidedControl(params, self._attitude, self._height)
+        self.sinks_from_ns = 0
+        """LAND holds its height until then, after a failsafe chose it."""
         self.thrust = self.collective = 0.0
         """Commanded mean thrust, as a fraction of full, before and after the boost for a lean."""
 
@@ -91,6 +93,7 @@ class CopterControl:
 
     def enter(self, mode: Mode, body: BodyState) -> None:
         self.reset(body)
+        self.sinks_from_ns = 0
         self.guided.enter(body, with_position=mode is Mode.GUIDED)
 
     def reset(self, body: BodyState) -> None:
@@ -118,10 +121,14 @@ class CopterControl:
             turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position)
             self.collective = boosted(self.thrust, body, self._params)
         else:
-            turn = self._lean(mode, sticks, body, has_position=has_position)
+            waits = now_ns < self.sinks_from_ns
+            climb_mps = 0.0 if waits else self._climb_mps(mode, sticks, body)
+            turn = self._lean(mode, sticks, body, climb_mps, has_position=has_position)
         return mix(self.collective, turn)
 
-    def _lean(self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool) -> Vec3:
+    def _lean(
+        self, mode: Mode, sticks: Sticks, body: BodyState, climb_mps: float, *, has_position: bool
+    ) -> Vec3:
         """Run one step of a leaning mode. Return the body angular acceleration [rad/s^2]."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
@@ -135,7 +142,7 @@ class CopterControl:
             self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
         else:
             limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
-            accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit)
+            accel = self._height.update(body, climb_mps, limit)
             self.thrust = thrust_for(accel, 1.0, self._params["MOT_THST_HOVER"])
             self.collective = boosted(self.thrust, body, self._params)
         return self._attitude.lean(body, roll, pitch, yaw_rate)

@@ -13,6 +13,7 @@ from helpers.copter_companion import (
     BRAKE,
     FAILED,
     GUIDED_NOGPS,
+    LAND,
     RTL,
     STABILIZE,
 )
@@ -162,3 +163,11 @@ def test_without_its_failsafe_the_last_stick_stays_for_good(airborne):
     messages = airborne.advance(5.0)
     assert math.degrees(last(messages, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert modes(messages)[-1] == ALT_HOLD
+
+
+def test_a_landing_by_failsafe_holds_the_height_for_four_seconds(airborne):
+    airborne.set_param("FS_THR_ENABLE", 3)
+    airborne.wait("HEARTBEAT", where=lambda m: m.custom_mode == LAND)
+    held, sinking = (last(airborne.advance(3.0), "LOCAL_POSITION_NED").vz for _ in range(2))
+    assert held == pytest.approx(0.0, abs=0.1)
+    assert sinking == pytest.approx(0.5, abs=0.1)
