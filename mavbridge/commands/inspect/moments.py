@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code, Kind
-from mavbridge.core.records import Tick
+from mavbridge.core.reasons import Code, Kind, Reason
+from mavbridge.core.records import FlightOutcome, Tick
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS, FlownChunk, FlownChunks
 from mavbridge.recording.crash import CrashWatch
@@ -183,7 +183,7 @@ def worst_moments(
     flight = next(iter(cameras.values()))
     moments = [
         *_crash(flight, ticks),
-        *_ends(ticks),
+        *_ends(ticks, flight.meta.outcome),
         *delays,
         *_coasting(ticks, limits),
         *_old_images(ticks),
@@ -217,15 +217,21 @@ def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
             return
 
 
-def _ends(ticks: Sequence[Tick]) -> Iterator[Moment]:
+def _ends(ticks: Sequence[Tick], outcome: FlightOutcome | None) -> Iterator[Moment]:
+    """Yield unplanned ends; the death of the guard has no tick of its own."""
+    if ticks[-1].trace is not None and outcome is not None and outcome.end == "fault":
+        yield _end(ticks, ticks[-1], ticks[-1].woke_ns, outcome.reason)
     for last, tick in pairwise(ticks):
         reason = tick.release_reason
         is_asked = reason is not None and (reason.kind is Kind.END or reason.code is Code.OPERATOR)
         is_planned = is_asked or (tick.phase == "ended" and reason is None)
         if last.trace is not None and tick.trace is None and not is_planned:
-            detail = f"{reason or 'no reason was recorded'}{_ages(last)}"
-            at_s = _t_s(ticks, tick.woke_ns)
-            yield Moment(at_s, "the policy's flight ended", END_MS, detail)
+            yield _end(ticks, last, tick.woke_ns, reason)
+
+
+def _end(ticks: Sequence[Tick], last: Tick, at_ns: int, reason: Reason | None) -> Moment:
+    detail = f"{reason or 'no reason was recorded'}{_ages(last)}"
+    return Moment(_t_s(ticks, at_ns), "the policy's flight ended", END_MS, detail)
 
 
 def _ages(tick: Tick) -> str:

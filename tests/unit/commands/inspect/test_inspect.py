@@ -24,7 +24,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, because, reason_to_json
-from mavbridge.core.records import Position, Tick, VehicleState, VisionTick
+from mavbridge.core.records import FlightOutcome, Position, Tick, VehicleState, VisionTick
 from mavbridge.recording.folder import read_meta
 from policy.contract import Contract
 
@@ -181,6 +181,20 @@ def test_a_planned_end_is_no_bad_moment_and_any_other_end_is(tmp_path: Path) -> 
     assert detail == (
         f"{LINK_LOST}; its last sticks were by an attitude of 3 ms ago and an image of 40 ms ago"
     )
+
+
+def test_the_death_of_the_guard_is_the_worst_moment_although_no_tick_tells_it(
+    tmp_path: Path,
+) -> None:
+    rest: dict[str, Any] = dict.fromkeys(
+        ("height_m", "speed_mps", "mode", "gates_total", "gates_passed", "course_s")
+    )
+    rest |= dict.fromkeys(("is_landed", "course_speed_mps", "crash")) | {"is_armed": True}
+    reason = because(Code.GUARD_DIED)
+    died = FlightOutcome(end="fault", reason=reason, flown_s=0.5, **rest)
+    (worst,) = moments_of(tmp_path / "flight", flown(50), outcome=died)
+    assert worst[0] == "the policy's flight ended"
+    assert worst[1].startswith(f"{reason}; its last sticks were by")
 
 
 def test_coasting_is_told_with_its_reason_even_where_the_recording_ends(tmp_path: Path) -> None:
