@@ -139,6 +139,8 @@ class StreamRequester:
         self._by_message: dict[str, _Stream] = {}
         self._pending: _Stream | None = None
         self._requested_ns = 0
+        self._heard_ns: int | None = None
+        """Arrival of the vehicle's newest message of any kind; None before the first."""
         self._window_ns: int | None = None
         """Start of the counting window; None while requests are open."""
         self._scaled_windows = 0
@@ -164,6 +166,7 @@ class StreamRequester:
 
     def receive(self, name: str, arrived_ns: int) -> None:
         """Count one message."""
+        self._heard_ns = arrived_ns
         if (stream := self._by_message.get(name)) is not None:
             stream.received[name] += 1
             stream.newest_ns = arrived_ns
@@ -196,6 +199,8 @@ class StreamRequester:
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
+            if self._heard_ns is not None and now_ns - self._heard_ns >= _WATCH_NS:
+                self._pending.attempts = 0  # off, or out of reach: it refuses nothing
             if self._pending.attempts >= (1 if self._pending.silences else _ATTEMPTS):
                 self._pending.refuse(is_silent=True)
                 if not self._pending.group.is_needed:  # the others first

@@ -66,11 +66,12 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     requester = StreamRequester(ARDUPILOT.streams(state_hz=100))
     requested = []
     for tick in range(3000):
+        now_ns = tick * 10 * NS_PER_MS
         for message in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "HIGHRES_IMU"):
-            requester.receive(message, 0)
+            requester.receive(message, now_ns)
         if tick % 2:
-            requester.receive("RC_CHANNELS", 0)
-        if (request := requester.step(tick * 10 * NS_PER_MS)) is None:
+            requester.receive("RC_CHANNELS", now_ns)
+        if (request := requester.step(now_ns)) is None:
             continue
         requested.append(request)
         is_needed = ids(request)[0] in (31, 32, 105, 65)
@@ -152,7 +153,7 @@ def test_a_stream_that_slows_down_is_requested_again(
     requested_s = []
     for tick in range(1000):
         if tick % (every if tick < 300 else slower) == 0:
-            requester.receive(message, 0)
+            requester.receive(message, tick * 10 * NS_PER_MS)
         if requester.step(tick * 10 * NS_PER_MS) is not None:
             requested_s.append(tick // 100)
             requester.receive_ack(ack(0))
@@ -261,6 +262,19 @@ def test_a_stream_that_is_granted_late_is_not_missed_before() -> None:
     link.unanswered = {5, 6, 7, 8}  # for the length of the first counting window
     link.run(10.0)
     assert link.texts == []
+
+
+def test_a_vehicle_that_was_off_is_asked_as_before() -> None:
+    """Not by legacy streams, which would bring a dozen other messages at 100 Hz as well."""
+    link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
+    link.run(5.0)
+    wanted = set(link.asked)
+    link.silent = link.mute = set(IDS.values())
+    link.run(12.0)
+    link.silent, link.mute, link.rates_hz = set(), set(), {IDS["HEARTBEAT"]: 1.0}
+    link.asked.clear()
+    link.run(6.0)
+    assert set(link.asked) == wanted
 
 
 def test_a_silence_of_the_whole_vehicle_is_told_as_no_lack_of_a_message() -> None:
