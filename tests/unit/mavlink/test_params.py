@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.parameters import ParamVehicle
+from helpers.parameters import SAFE, ParamVehicle
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.link_settings import LinkSettings, SigningFiles
@@ -243,7 +243,8 @@ def test_all_is_read_before_the_output_is_known_and_nothing_is_read_twice() -> N
     vehicle = after_reading(ParamVehicle({"RC_OVERRIDE_TIME": 3.0}, output=None))
     assert vehicle.problem() is None
     assert vehicle.texts == []  # nobody is advised about an output that may not be used
-    count = len(vehicle.requests)
+    assert len({request.name for request in vehicle.requests}) > len(vehicle.params.values)
+    vehicle.requests.clear()
     vehicle.params.use_output("rates")
     problem = vehicle.problem()
     assert (problem.code, dict(problem.data)["what"]) == (Code.OBSTACLE, "not fly by our setpoints")
@@ -251,7 +252,7 @@ def test_all_is_read_before_the_output_is_known_and_nothing_is_read_twice() -> N
     vehicle.set_by_pilot("GUID_OPTIONS", 8.0)
     assert vehicle.problem() is None
     vehicle.run(3.0)
-    assert len(vehicle.requests) == count
+    assert not {request.name for request in vehicle.requests} & set(vehicle.params.values)
     assert [text for text in vehicle.texts if "--set GUID_TIMEOUT=0.5" in text]
     assert not [text for text in vehicle.texts if "RC_OVERRIDE_TIME" in text]
 
@@ -267,6 +268,32 @@ def test_what_was_given_up_before_the_first_answer_is_read_after_it() -> None:
     assert set(vehicle.params.values) == set(answered) & vehicle.params._relevant
     assert vehicle.params.override_switch == 7
     assert vehicle.params.values["PILOT_Y_RATE"] == 99.0
+
+
+@pytest.mark.parametrize("lasts_s", [2.0, 20.0])
+def test_what_was_given_up_in_a_gap_of_the_link_is_read_after_it(lasts_s: float) -> None:
+    """In the middle of the reading, by a reboot for example: each safety check needs its value."""
+    values = dict.fromkeys(ARDUPILOT.params, 7.0) | SAFE | {"PILOT_Y_RATE": 99.0}
+    vehicle = ParamVehicle(values=dict(values))
+    vehicle.step()
+    vehicle.step()
+    vehicle.fall_silent()
+    vehicle.run(lasts_s)
+    vehicle.values |= values
+    vehicle.run(2 * lasts_s + 4.0)
+    assert vehicle.params._relevant <= set(vehicle.params.values)
+    vehicle.requests.clear()
+    vehicle.run(20.0)
+    assert vehicle.requests == []
+
+
+def test_what_the_vehicle_lacks_is_asked_for_ever_more_rarely() -> None:
+    vehicle = after_reading(ParamVehicle())
+    lacking = set(ARDUPILOT.params) - set(vehicle.values)
+    vehicle.run(60.0)
+    vehicle.requests.clear()
+    vehicle.run(60.0)
+    assert len(vehicle.requests) <= 2 * 4 * len(lacking)
 
 
 def test_what_only_another_output_needs_does_not_matter() -> None:

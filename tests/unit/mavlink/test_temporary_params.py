@@ -102,7 +102,7 @@ def test_nothing_is_set_or_put_back_while_armed() -> None:
     assert vehicle.problem() == because(Code.SET_NEEDS_DISARMING)
     assert vehicle.writes == []
     vehicle.armed = False
-    vehicle.run(1.0)
+    vehicle.run(2.0)  # what it did not send is asked for once more
     assert vehicle.problem() is None
     vehicle.armed = True
     vehicle.run(1.0)

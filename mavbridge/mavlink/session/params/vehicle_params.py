@@ -146,7 +146,8 @@ class VehicleParams:
         self._relevant: set[str] = set()
         self._kinds: dict[str, int] = {}
         """MAV_PARAM_TYPE of each relevant parameter that was received."""
-        self._again_ns = 0
+        self._again_ns = self._rounds = 0
+        """Next attempt to read what the vehicle did not send, and number of these attempts."""
         self.values: dict[str, float] = {}
         """Relevant parameters received from the vehicle, by name."""
         self._read((*profile.params, *(name for name, _ in config.set_params)))
@@ -271,13 +272,15 @@ class VehicleParams:
         return request._replace(kind=self._kinds.get(request.name, request.kind)).as_bytes()
 
     def _ask_for_missing(self, now_ns: int, status: VehicleStatus | None) -> None:
-        """Request missing parameters, on the ground."""
+        """Request missing parameters, on the ground: the needed ones in every round, all in rounds
+        1, 2, 4, 8 and so on. On a lossy link the vehicle may have them."""
         is_usable = self._assessed is not None and self._assessed.unusable is None
         is_flying = self.is_read and is_usable and status is not None and status.armed
         if now_ns < self._again_ns or is_flying:
             return
-        self._again_ns = now_ns + _AGAIN_NS
-        self._read(self._profile.needed_params(self.values))
+        self._again_ns, self._rounds = now_ns + _AGAIN_NS, self._rounds + self.is_read
+        others = self._relevant if self._rounds.bit_count() == 1 else ()
+        self._read((*self._profile.needed_params(self.values), *others))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
