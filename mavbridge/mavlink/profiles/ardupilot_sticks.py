@@ -197,7 +197,8 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
         low, trim, high, dead = (
             values.get(f"RC{number:g}_{part}", 0.0) for part in ("MIN", "TRIM", "MAX", "DZ")
         )
-        if stick != "RCMAP_THROTTLE" and low < trim < high and dead >= min(trim - low, high - trim):
+        shorter_us = min(trim - low, high - trim)
+        if stick != "RCMAP_THROTTLE" and low < high and 0 <= shorter_us <= dead:
             yield ParamNote(
                 "obstacle",
                 (f"RC{number:g}_DZ", f"RC{number:g}_TRIM"),

@@ -217,6 +217,8 @@ def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: floa
     [
         ({}, False),
         ({"RC1_TRIM": 1981.0}, True),
+        ({"RC1_TRIM": 2000.0}, True),
+        ({"RC2_TRIM": 1000.0, "RC2_DZ": 0.0}, True),
         ({"RC1_MIN": 1490.0}, True),
         ({"RC2_DZ": 600.0}, True),
         ({"RC3_DZ": 600.0}, False),  # the throttle counts from the bottom
