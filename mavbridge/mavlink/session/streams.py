@@ -73,8 +73,9 @@ class _Stream:
         self.is_settled, self.has_settled, self.attempts = True, True, 0
         self.is_given_up = is_given_up
 
-    def refuse(self, *, is_silent: bool = False) -> None:
-        """Go on to the next option, after silence to REQUEST_DATA_STREAM, if there is one.
+    def refuse(self, *, is_silent: bool = False, has_answered: bool = True) -> None:
+        """Go on to the next option; after silence of a vehicle that has answered no request, to
+        REQUEST_DATA_STREAM, if there is one.
 
         An optional group is given up, after silence until its rate is looked at.
         """
@@ -84,7 +85,7 @@ class _Stream:
         elif not is_silent:
             self._at = (self._at + 1) % len(self._options)
             self.is_denied = self._at == 0
-        elif self.group.stream is not None:
+        elif self.group.stream is not None and not has_answered:
             self._at = len(self._options) - 1
 
     def arriving_hz(self, span_s: float) -> float:
@@ -139,8 +140,8 @@ class StreamRequester:
         self._by_message: dict[str, _Stream] = {}
         self._pending: _Stream | None = None
         self._requested_ns = 0
-        self._heard_ns: int | None = None
-        """Arrival of the vehicle's newest message of any kind; None before the first."""
+        self._has_answered = False
+        """True if the vehicle has granted or denied a request: then silence is a loss."""
         self._window_ns: int | None = None
         """Start of the counting window; None while requests are open."""
         self._scaled_windows = 0
@@ -166,7 +167,6 @@ class StreamRequester:
 
     def receive(self, name: str, arrived_ns: int) -> None:
         """Count one message."""
-        self._heard_ns = arrived_ns
         if (stream := self._by_message.get(name)) is not None:
             stream.received[name] += 1
             stream.newest_ns = arrived_ns
@@ -186,7 +186,7 @@ class StreamRequester:
             return
         if ack.result in _UNDECIDED:
             return  # repeated as if there were no answer
-        self._pending.silences = 0
+        self._pending.silences, self._has_answered = 0, True
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.settle()
         else:
@@ -199,10 +199,8 @@ class StreamRequester:
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
-            if self._heard_ns is not None and now_ns - self._heard_ns >= _WATCH_NS:
-                self._pending.attempts = 0  # off, or out of reach: it refuses nothing
             if self._pending.attempts >= (1 if self._pending.silences else _ATTEMPTS):
-                self._pending.refuse(is_silent=True)
+                self._pending.refuse(is_silent=True, has_answered=self._has_answered)
                 if not self._pending.group.is_needed:  # the others first
                     pause_ns = min(_WATCH_NS << self._pending.silences, _PAUSE_NS)
                     self._pending.due_ns = now_ns + pause_ns

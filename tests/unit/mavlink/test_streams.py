@@ -277,6 +277,13 @@ def test_a_vehicle_that_was_off_is_asked_as_before() -> None:
     assert set(link.asked) == wanted
 
 
+def test_a_vehicle_whose_answers_get_lost_is_asked_on() -> None:
+    link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
+    link.unanswered = set(range(2, 8))
+    link.run(5.0)
+    assert link.asked[1:8] == [(IDS["LOCAL_POSITION_NED"], 100.0)] * 7
+
+
 def test_a_silence_of_the_whole_vehicle_is_told_as_no_lack_of_a_message() -> None:
     link = Link(PX4.streams(state_hz=100), capacity_hz=1e4)
     for silent_s in (4.5, 6.0):
