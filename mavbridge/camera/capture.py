@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from mavbridge.camera.grabber import Image
+from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.provenance import without_secrets
@@ -40,15 +41,23 @@ class CaptureSource:
     has_driver_stamps: bool = False
     """True on a device. Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as
     CAP_PROP_POS_MSEC (modules/videoio/src/cap_v4l.cpp); other systems return something else."""
+    bad_frames: int = 0
+    """Consecutive frames that could not be decoded: cables damage MJPEG."""
 
-    def next_image(self) -> Image:
+    def next_image(self) -> Image | None:
         """See `ImageSource`."""
         if not self.capture.grab():
             raise CameraError(f"{self.name} {self.failure}")
         arrived_ns, stamp_ms = self.clock.now_ns(), 0.0
         if self.has_driver_stamps:
             stamp_ms = self.capture.get(cv2.CAP_PROP_POS_MSEC)
-        return Image(arrived_ns, retrieve_rgb(self.capture, self.name), round(stamp_ms * NS_PER_MS))
+        if (rgb := retrieve_rgb(self.capture)) is not None:
+            self.bad_frames = 0
+            return Image(arrived_ns, rgb, round(stamp_ms * NS_PER_MS))
+        self.bad_frames += 1
+        if self.bad_frames > MAX_BAD_FRAMES:
+            raise CameraError(f"{self.name}: {self.bad_frames} frames in a row are damaged")
+        return None
 
     def close(self) -> None:
         """See `ImageSource`."""
@@ -123,11 +132,11 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
             del os.environ[name]
 
 
-def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
-    """Return the grabbed frame in RGB or as depth. Raises CameraError if it cannot be decoded."""
+def retrieve_rgb(capture: cv2.VideoCapture) -> CameraImage | None:
+    """Return the grabbed frame in RGB or as depth; None if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
-    if not decoded:
-        raise CameraError(f"{name}: a frame cannot be decoded")
+    if not decoded or bgr is None:  # OpenCV's own decoder of MJPEG returns True and None
+        return None
     if bgr.ndim == 2:
         return np.asarray(bgr, dtype=np.uint16)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -85,7 +85,8 @@ class VideoFileCamera:
         if not self._capture.grab():
             return None
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
-        rgb = retrieve_rgb(self._capture, str(self._path))
+        if (rgb := retrieve_rgb(self._capture)) is None:
+            raise CameraError(f"{self._path}: a frame cannot be decoded")
         rgb.flags.writeable = False
         if previous_ns is not None and stamp_ns <= previous_ns:
             stamp_ns = previous_ns + self._interval_ns

@@ -146,7 +146,7 @@ class RtpSender:
 
 
 class FakeCapture:
-    """Stands in for cv2.VideoCapture; a stamp of -1 is a frame that cannot be decoded."""
+    """Stands in for cv2.VideoCapture; stamps of -1 and -2 are frames that cannot be decoded."""
 
     def __init__(self, stamps_ms: Iterable[float], *, fps: float = 0.0) -> None:
         self.settings: dict[int, float] = {}
@@ -169,7 +169,9 @@ class FakeCapture:
         self._stamp_ms = self._stamps_ms.pop(0)
         return True
 
-    def retrieve(self) -> tuple[bool, np.ndarray]:
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        if self._stamp_ms == -2:
+            return True, None  # as OpenCV's own decoder of MJPEG
         return self._stamp_ms >= 0, np.array([[[1, 2, 3]]], np.uint8)
 
     def release(self) -> None:

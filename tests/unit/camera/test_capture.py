@@ -8,7 +8,7 @@ import pytest
 from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS
 from mavbridge.camera import capture
-from mavbridge.camera.capture import device_mode, open_device, open_stream
+from mavbridge.camera.capture import CaptureSource, device_mode, open_device, open_stream
 from mavbridge.camera.grabber import ExposureClock
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -59,6 +59,17 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch, clock):
     with pytest.raises(CameraError, match="unplugged"):
         source.next_image()
     source.close()
+
+
+@pytest.mark.parametrize("damaged", [-1.0, -2.0])
+def test_damaged_frames_of_a_device_are_passed_over_unless_they_go_on(damaged, clock):
+    stamps_ms = [1.0, *[damaged] * 10, 2.0, *[damaged] * 11]
+    source = CaptureSource(FakeCapture(stamps_ms), "camera 0", "has ended", clock, True)
+    images = [source.next_image() for _ in range(22)]
+    stamps_ns = [image.stamp_ns for image in images if image is not None]
+    assert stamps_ns == [NS_PER_MS, 2 * NS_PER_MS]
+    with pytest.raises(CameraError, match="camera 0: 11 frames in a row are damaged"):
+        source.next_image()
 
 
 @pytest.mark.parametrize(
