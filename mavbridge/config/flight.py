@@ -153,6 +153,11 @@ class LinkConfig(ListenConfig):
                 )
             if name in read:
                 raise UserError(f"--set names {name} twice: leave one out")
+            if name.startswith("RCMAP_"):
+                raise UserError(
+                    f"--set {text}: it counts from the vehicle's next boot on; set it with your "
+                    "ground station, and reboot the vehicle"
+                )
             read[name] = value
         return tuple(read.items())
 

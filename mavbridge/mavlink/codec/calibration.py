@@ -78,8 +78,8 @@ class RcCalibration:
         numbers = [channel.number for channel in self.channels]
         if len(set(numbers)) != 4:
             raise ValueError(
-                f"RCMAP_* puts two sticks on one channel: {numbers}; use --set RCMAP_ROLL=1 and so "
-                "on to give each its own"
+                f"RCMAP_* puts two sticks on one channel: {numbers}; give each its own by "
+                "RCMAP_ROLL=1 and so on, and reboot the vehicle"
             )
         for channel in self.channels[1:]:
             if not channel.min_us <= channel.trim_us <= channel.max_us:

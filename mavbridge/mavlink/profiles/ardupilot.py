@@ -17,6 +17,7 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     ardupilot_curves,
     calibration,
     is_simple_setting,
+    map_notes,
     stick_names,
     stick_notes,
 )
@@ -191,6 +192,7 @@ def _override_notes(
     if options & _IGNORE_OVERRIDES:
         effect, mended = ", whose bit 1 ignores overrides", options & ~_IGNORE_OVERRIDES
         yield ParamNote.of("obstacle", "RC_OPTIONS", options, effect, mended)
+    yield from map_notes(values, context.booted)
     yield from stick_notes(values)
     yield from _timeout_notes(values, context)
     for names, unknown in (

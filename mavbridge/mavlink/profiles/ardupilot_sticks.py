@@ -154,7 +154,9 @@ def calibration(values: Mapping[str, float]) -> RcCalibration:
 def _channel(values: Mapping[str, float], stick: str) -> RcChannel:
     number = int(_require(values, stick))
     if number not in range(1, 9):
-        raise ValueError(f"{stick} is {number}, and sticks go to channels 1 to 8: --set {stick}=N")
+        raise ValueError(
+            f"{stick} is {number}, and sticks go to channels 1 to 8: set it, and reboot the vehicle"
+        )
     return RcChannel(
         number=number,
         min_us=int(_require(values, f"RC{number}_MIN")),
@@ -171,6 +173,14 @@ def _require(values: Mapping[str, float], name: str) -> float:
             "input, and answer anything (mavbridge check)?"
         )
     return values[name]
+
+
+def map_notes(values: Mapping[str, float], booted: Mapping[str, float]) -> Iterator[ParamNote]:
+    """Yield RCMAP_* that have changed since they were first read: they count from the next boot."""
+    for stick in filter(values.get, map("RCMAP_{}".format, STICKS)):
+        if (old := booted.get(stick, values[stick])) != values[stick]:
+            effect = f", and it goes on with {old:g} until its next boot: reboot it"
+            yield ParamNote.of("obstacle", stick, values[stick], effect)
 
 
 def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:

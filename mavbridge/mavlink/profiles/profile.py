@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -183,6 +184,9 @@ class ParamContext(NamedTuple):
     accepted_risks: tuple[Risk, ...] = ()
     serial: tuple[ParamNote, ...] = ()
     """Risks of the serial port."""
+    booted: Mapping[str, float] = MappingProxyType({})
+    """First value of each parameter in this session, which counts until the vehicle's next boot for
+    parameters that are read at boot alone."""
 
 
 class Traits(NamedTuple):

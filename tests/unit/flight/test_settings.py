@@ -119,10 +119,11 @@ def test_a_mode_in_which_the_policy_does_not_fly_is_refused(mode: str) -> None:
         *(("A",), ("A=",), ("A=fast",), ("A=nan",), ("A=1e39",), ("../A=1",)),
         ("A_NAME_THAT_IS_TOO_LONG=1",),
         ("A=1", "a=2"),
+        ("rcmap_yaw=5",),
     ],
 )
 def test_a_parameter_that_cannot_be_set_is_refused(flags: tuple[str, ...]) -> None:
-    with pytest.raises(UserError, match=r"NAME=VALUE|names A twice"):
+    with pytest.raises(UserError, match=r"NAME=VALUE|names A twice|next boot"):
         LinkConfig(set=flags)
 
 

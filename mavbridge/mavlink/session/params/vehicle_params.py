@@ -138,7 +138,9 @@ class VehicleParams:
         self._config = config
         self._report = report
         risks, port = config.accepted_risks, serial_risks(config, streams)
-        self._context = ParamContext(None, config.source_system, None, None, risks, port)
+        self._booted: dict[str, float] = {}
+        system = config.source_system
+        self._context = ParamContext(None, system, None, None, risks, port, self._booted)
         self._open: dict[str, tuple[int, int]] = {}
         """Time of the last request and number of requests, by name of a parameter to read."""
         self.has_answered = False
@@ -200,6 +202,7 @@ class VehicleParams:
         if param.name not in self._relevant or param.value == old:
             return
         self.values[param.name], self._kinds[param.name] = param.value, param.kind
+        self._booted.setdefault(param.name, param.value)
         self.traits = self._profile.traits(self.values)
         if not self.is_read:
             return
