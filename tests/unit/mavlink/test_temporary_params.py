@@ -95,6 +95,19 @@ def test_a_parameter_that_does_not_exist_forbids_the_flight() -> None:
     assert vehicle.writes == []
 
 
+def test_a_parameter_whose_value_comes_late_is_set_then() -> None:
+    vehicle = start(set_params=(*WANTED, ("PILOT_Y_RATE", 90.0)))
+    vehicle.run(2.0)
+    told_first = because(Code.SET_ABSENT, name="PILOT_Y_RATE", value=90.0)
+    assert vehicle.problem() == told_first
+    vehicle.values["PILOT_Y_RATE"] = 120.0  # its answers were lost
+    vehicle.run(6.0)
+    assert vehicle.problem() is None
+    assert vehicle.values["PILOT_Y_RATE"] == 90.0
+    end(vehicle)
+    assert (vehicle.values["PILOT_Y_RATE"], vehicle.values["RC_OVERRIDE_TIME"]) == (120.0, 3.0)
+
+
 def test_nothing_is_set_or_put_back_while_armed() -> None:
     vehicle = start()
     vehicle.armed = True

@@ -72,8 +72,14 @@ class TemporaryParams:
         write = (self._open or {}).get(param.name)
         if write is not None and write.attempts and not write.is_confirmed:
             write.answer = param.value
-        if param.name in self._failures and is_same(param.value, self._wanted[param.name]):
+        if (why := self._failures.get(param.name)) is None:
+            return
+        wanted, is_late = self._wanted[param.name], why.code is Code.SET_ABSENT
+        if is_same(param.value, wanted):
             del self._failures[param.name]
+        elif is_late and self._open is not None and not self._is_ending:  # the first were lost
+            del self._failures[param.name]
+            self._before[param.name], self._open[param.name] = param.value, _Write(wanted)
 
     def step(
         self, now_ns: int, values: Mapping[str, float], *, is_complete: bool, is_disarmed: bool
