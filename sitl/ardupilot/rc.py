@@ -12,6 +12,7 @@ from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
 from sitl.vehicle.firmware import Held, Receiver
 
+STICKS = ("ROLL", "PITCH", "THROTTLE", "YAW")
 CHANNELS = 16
 PRIMARY_CHANNELS = 8  # 0 and the highest values mean something else on channels 9-16
 IGNORE = 65535
@@ -36,6 +37,8 @@ class RcEngine:
 
     def __init__(self, params: ArduPilotParams, receiver: Receiver) -> None:
         self._params = params
+        mapped = {axis: params.integer(f"RCMAP_{axis}") for axis in STICKS}
+        self._indices = {n: min(max(c, 1), RC_CHANNELS_WITH_PARAMS) - 1 for n, c in mapped.items()}
         self._receiver = receiver
         self._override_us = [RELEASE] * CHANNELS
         self._override_ns = [0] * CHANNELS
@@ -87,13 +90,12 @@ class RcEngine:
         self._override_us = [RELEASE] * CHANNELS
 
     def index_of(self, axis: str) -> int:
-        """Return the zero-based channel of ROLL, PITCH, THROTTLE or YAW by RCMAP_*."""
-        mapped = self._params.integer(f"RCMAP_{axis}")
-        return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
+        """Return the zero-based channel of one of ``STICKS``, by RCMAP_* at boot."""
+        return self._indices[axis]
 
     def sticks_us(self) -> tuple[int, int, int, int]:
         """Return the roll, pitch, throttle and yaw that the modes use [us], by RCMAP_*."""
-        roll, pitch, throttle, yaw = map(self.index_of, ("ROLL", "PITCH", "THROTTLE", "YAW"))
+        roll, pitch, throttle, yaw = map(self.index_of, STICKS)
         channels_us = self.channels_us
         return channels_us[roll], channels_us[pitch], channels_us[throttle], channels_us[yaw]
 

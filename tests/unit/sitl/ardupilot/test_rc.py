@@ -65,6 +65,9 @@ def test_centred_sticks_have_a_dead_zone_and_end_stops(pwm, roll):
 def test_reversed_channels_and_channel_map():
     sticks, _ = sticks_at(pwm=[1500, 1500, 1000, 1500, 1740], RCMAP_ROLL=5.0, RC5_REVERSED=1.0)
     assert sticks.roll == pytest.approx(-0.48)
+    rc, params = engine()
+    params.set("RCMAP_ROLL", 5.0)
+    assert rc.index_of("ROLL") == 0  # until the next boot
 
 
 @given(st.integers(0, 65534), st.integers(0, 65534))
