@@ -229,6 +229,8 @@ def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterat
         why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
         yield ParamNote.of_risk("endless-override", why, name, f"--set {name}=0.5")
     yield from long_timeout(values, name, "hold its last sticks")
+    if context.has_receiver is False:  # overrides that have ended are then kept until the failsafe
+        yield from long_timeout(values, "RC_FS_TIMEOUT", "hold its last sticks")
     failsafe = "not 0" if context.has_receiver else "not 0, without a receiver"
     yield ParamNote("wanted", ("FS_THR_ENABLE",), failsafe)
     if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:

@@ -212,6 +212,18 @@ def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: floa
     assert notes_of(ARDUPILOT, RCMAP | {name: value}, "velocity") == []
 
 
+@pytest.mark.parametrize("has_receiver", [None, True, False])
+@pytest.mark.parametrize("time_s", [1.0, 5.0])
+def test_a_late_radio_failsafe_is_told_where_it_alone_ends_the_last_sticks(
+    time_s: float, has_receiver: bool | None
+) -> None:
+    """Measured: 5 s of RC_FS_TIMEOUT without a receiver are 5 s with the last lean."""
+    values = {"RC_FS_TIMEOUT": time_s}
+    notes = notes_of(ARDUPILOT, values, "rc-override", kind="advice", has_receiver=has_receiver)
+    is_told = any("--set RC_FS_TIMEOUT=0.5" in note.text for note in notes)
+    assert is_told is (time_s > 1.0 and has_receiver is False)
+
+
 @pytest.mark.parametrize(
     ("change", "is_refused"),
     [
