@@ -4,6 +4,7 @@ An engine that cannot be created, or fails the parity check, is skipped with a n
 Torch, the reference, is last.
 """
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,6 +27,7 @@ from policy.engines.torch_engines import (
     make_cuda_graph_runner,
     make_torch_runner,
     modules_of,
+    outside_calls,
     snapshot,
 )
 from policy.errors import Agreed, NoChunkError, PolicyError, warned
@@ -151,7 +153,8 @@ def first_that_agrees(
         except NoChunkError as error:
             note = f"engine torch: it has no chunk for a sample, which a graph cannot say: {error}"
             return make_torch_runner(policy, settings), (note,)
-        if (impure := _impurity(policy, before, reference, samples, expected)) is not None:
+        impure = _impurity(policy, before, reference, samples, expected, settings)
+        if impure is not None:
             return make_torch_runner(policy, settings), (impure,)
         runner, notes = first_with_chunks(expected, samples, candidates)
         if runner is not None:
@@ -206,6 +209,7 @@ def _impurity(
     reference: PolicyRunner,
     samples: ParitySamples,
     expected: FloatArray,
+    settings: ExecutionSettings,
 ) -> str | None:
     """Return a note on why no graph can compute this policy; None if one may."""
     if isinstance(policy, BuiltinPolicy):
@@ -213,11 +217,16 @@ def _impurity(
     if changed := changes(before, snapshot(policy)):
         kept = ", ".join(changed)
         return f"engine torch: it keeps {kept} from call to call, which a graph cannot"
-    encoded = encode_all(reference, samples.rgb[0])
-    again = reference.act(encoded, samples.state[:1], samples.history[:1])[0]
-    if np.array_equal(again, expected[0]):
-        return None
-    return warned(f"engine torch: {_NOT_REPEATED}")
+    with outside_calls() as called:
+        encoded = encode_all(reference, samples.rgb[0])
+        again = reference.act(encoded, samples.state[:1], samples.history[:1])[0]
+    if not np.array_equal(again, expected[0]):
+        return warned(f"engine torch: {_NOT_REPEATED}")
+    if called:
+        return f"engine torch: it calls {', '.join(sorted(called))}, which a graph cannot"
+    if settings.threads is not None and not settings.threads.issuperset(threading.enumerate()):
+        return "engine torch: it runs threads, whose news a graph would not see"
+    return None
 
 
 def _candidates(

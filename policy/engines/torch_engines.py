@@ -9,6 +9,7 @@ import re
 import sys
 from collections import UserDict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import _lru_cache_wrapper, partial
 from gc import get_referents
 from io import IOBase
@@ -23,6 +24,7 @@ from types import (
     ModuleType,
     SimpleNamespace,
 )
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,6 +47,13 @@ for its results."""
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
 _OURS = ("policy", "mavbridge")
 _OF_TORCH = frozenset(vars(nn.Module()))
+_OUTSIDE = frozenset(
+    (
+        *("time", "datetime", "io", "_io", "posix", "mmap", "_multiprocessing"),
+        *("_thread", "_queue", "_socket", "select"),
+    )
+)
+"""Modules of Python's own by which a function learns what its arguments do not say."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
@@ -226,6 +235,26 @@ def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
     """Return the names, without the path, of attributes that were added, removed or changed."""
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     return sorted({re.sub(r"\[.*?\]", "", name).rpartition(".")[2] for name in names})
+
+
+@contextmanager
+def outside_calls() -> Iterator[set[str]]:
+    """Context manager: yield the names, complete at its end, of this thread's calls that read a
+    clock, file, socket or lock."""
+    names, before = set[str](), sys.getprofile()
+
+    def note(_frame: object, event: str, called: Any) -> None:
+        if event == "c_call":
+            owner = getattr(called, "__self__", None)
+            kind = owner if isinstance(owner, type) else type(owner)
+            if (getattr(called, "__module__", None) or kind.__module__) in _OUTSIDE:
+                names.add(called.__name__)
+
+    sys.setprofile(note)
+    try:
+        yield names
+    finally:
+        sys.setprofile(before)
 
 
 def _mark(value: object) -> object:

@@ -3,6 +3,7 @@
 ``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from dataclasses import replace
@@ -98,10 +99,11 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
     """Find, load, try and time a policy; ``now_s`` (monotonic seconds) also drives programs."""
     check_request(request)
+    threads = frozenset(threading.enumerate())
     policy, notes, make_runner = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
-        settings = _settings(policy, request, notes)
+        settings = replace(_settings(policy, request, notes), threads=threads)
         runner, engine_notes = (make_runner or partial(_on_engine, policy, request))(settings)
         if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)

@@ -1,10 +1,14 @@
 """Torch policies as a user might write them, small and untrained."""
 
 import itertools
+import queue
+import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -280,6 +284,51 @@ class Drawing(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         chunk = super().predict_fast(feature, state, history, steps)
         return chunk + 0.1 * torch.randn_like(chunk)
+
+
+class OnSchedule(TwoRates):
+    """Turns half a minute after its start."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turns = datetime.now(UTC) + timedelta(seconds=30)
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return -chunk if datetime.now(UTC) > self.turns else chunk
+
+
+class ReadingFile(TwoRates):
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk if Path(__file__).read_text() else -chunk
+
+
+class ReadingQueue(TwoRates):
+    def __init__(self) -> None:
+        super().__init__()
+        self.news: queue.SimpleQueue[float] = queue.SimpleQueue()
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk if self.news.empty() else chunk * self.news.get()
+
+
+class Listening(TwoRates):
+    """A thread tells it where to fly."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.goal, self.told = 0.0, threading.Event()
+        self.thread = threading.Thread(target=self.listen, daemon=True)
+        self.thread.start()
+
+    def listen(self) -> None:
+        self.told.wait()
+        self.goal = 0.5
+
+    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
+        return 0.0 * super().predict_fast(feature, state, history, steps) + self.goal
 
 
 class Resetting(TwoRates):

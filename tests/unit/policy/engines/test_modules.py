@@ -2,6 +2,7 @@
 
 import logging
 import re
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from helpers.torch_policies import Counter, TwoRates
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
 from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
-from policy.engines.runner import ExecutionSettings
+from policy.engines.runner import ExecutionSettings, dummy_sample, encode_all
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
@@ -43,6 +44,9 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("CountingBelow", "it keeps calls, clock from call to call"),
         ("CountingInSlots", "it keeps calls, clock from call to call"),
         ("Drawing", "warning: engine torch: the same inputs do not give the same chunk again"),
+        ("OnSchedule", "it calls now, which a graph cannot"),
+        ("ReadingFile", "it calls .*open.*read"),
+        ("ReadingQueue", "it calls empty, which a graph cannot"),
         ("Resetting", "the policy has reset"),
         ("Deciding", "it decides by the values of a tensor"),
         ("DecidingByMin", "it decides by the values of a tensor"),
@@ -81,6 +85,18 @@ def test_a_memory_behind_functions_is_found(count: Callable[[], object]) -> None
     runner, notes = choose_runner(torch_policies.CountingBy(count), "auto", SETTINGS)
     assert runner.engine == "torch"
     assert notes == ("engine torch: it keeps calls from call to call, which a graph cannot",)
+
+
+def test_what_a_thread_of_the_policy_tells_it_is_flown() -> None:
+    settings = replace(SETTINGS, threads=frozenset(threading.enumerate()))
+    assert choose_runner(TwoRates(), "auto", settings)[0].engine.startswith("openvino")
+    policy = torch_policies.Listening()
+    runner, notes = choose_runner(policy, "auto", settings)
+    assert notes == ("engine torch: it runs threads, whose news a graph would not see",)
+    policy.told.set()
+    policy.thread.join()
+    images, state, history = dummy_sample(runner.contract)
+    assert (runner.act(encode_all(runner, images), state, history) == 0.5).all()
 
 
 def test_what_python_keeps_in_a_module_is_no_memory() -> None:
