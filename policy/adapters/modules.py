@@ -85,6 +85,12 @@ def load_torchscript(
             module = torch.jit.load(library_name(path), map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError) as error:
         raise CheckpointError(why_unreadable(path, error)) from error
+    graphs = [part.graph for part in module.modules() if _has_forward(part)]
+    if any(_is_training(node) for each in graphs for node in each.findAllNodes("aten::batch_norm")):
+        raise CheckpointError(
+            f"{path} was traced in training mode, in which a batch norm scales each image by its "
+            "own statistics: call eval() of the module before torch.jit.trace"
+        )
     contract = replace(description.interface.contract, arrays="torch")
     interface = replace(description.interface, contract=contract)
     policy = adopt_modules(spec, module, replace(description, interface=interface), seed)
@@ -239,6 +245,12 @@ def _has_forward(holder: object) -> bool:
     if isinstance(holder, torch.jit.ScriptModule):
         return _is_script(getattr(holder, "forward", None))
     return isinstance(holder, nn.Module) and type(holder).forward is not nn.Module.forward
+
+
+def _is_training(batch_norm: Any) -> bool:
+    """True if a graph's batch norm is fixed in training mode; without averages it has only one."""
+    _, _, _, average, _, is_training, *_ = batch_norm.inputs()
+    return is_training.toIValue() is True and not average.node().mustBeNone()
 
 
 class _Call:

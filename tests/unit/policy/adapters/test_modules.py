@@ -200,6 +200,24 @@ def test_arguments_in_another_order_are_refused(tmp_path: Path, module: nn.Modul
         load(f"torchscript:{path}")
 
 
+class Normed(nn.Module):
+    def __init__(self, *, has_averages: bool = True) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(3, track_running_stats=has_averages)
+
+    def forward(self, image: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(1, 8, 4) + self.norm(image).square().mean()
+
+
+def test_a_batch_norm_that_was_traced_in_training_mode_is_refused(tmp_path: Path) -> None:
+    for module in (Normed().eval(), Normed(has_averages=False).train()):
+        path = archive(tmp_path, torch.jit.trace(module, FORWARD_EXAMPLES[:2]), described())
+        assert load(f"torchscript:{path}", dual_rate=False)
+    path = archive(tmp_path, torch.jit.trace(Normed().train(), FORWARD_EXAMPLES[:2]), described())
+    with pytest.raises(PolicyError, match=r"traced in training mode.*call eval\(\)"):
+        load(f"torchscript:{path}", dual_rate=False)
+
+
 def zipped(description: bytes) -> bytes:
     with zipfile.ZipFile(content := io.BytesIO(), "w") as file:
         file.writestr("mine/code/x.py", "")
