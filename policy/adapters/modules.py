@@ -25,7 +25,7 @@ from policy.adapters.interface import Interface
 from policy.contract import ACTION_DIM
 from policy.engines.torch_engines import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
-from policy.files import library_name, why_unreadable
+from policy.files import last_line, library_name, why_unreadable
 from policy.nets.diffusion import NoiseSchedule, flight_noise
 from policy.protocol import SingleRatePolicy, predict_by_pair, predict_by_steps
 
@@ -216,29 +216,34 @@ def _takes_no_image(call: "_Call", interface: Interface) -> bool:
     """True if the first argument of a forward is the state.
 
     Decided by the argument's name; a single argument without a telling name is tried. Raises
-    PolicyError if it accepts both.
+    PolicyError if it accepts neither, or both and may be either by its name.
     """
     first = next(iter(call.names), "")
-    if first in USUAL_NAMES["state"]:
-        return True
-    if len(call.names) != 1 or first in (*USUAL_NAMES["image"], *interface.camera_keys):
-        return False
+    is_state, is_observation = first in USUAL_NAMES["state"], first.startswith("obs")
+    is_told = is_state or first in (*USUAL_NAMES["image"], *interface.camera_keys)
+    if len(call.names) != 1 or (is_told and not is_observation):
+        return is_state
     contract = interface.contract
     shapes = ((*contract.state_shape[:-1], interface.state_dim), contract.image_shape)
-    accepted = []
+    refusals = []
     for shape in shapes:
         try:
             with torch.inference_mode(), suppress(PolicyError):  # it ran: its result comes later
                 call(torch.zeros(1, *shape))
-            accepted.append(True)
-        except Exception:  # noqa: BLE001 - a foreign module may raise anything
-            accepted.append(False)
-    if all(accepted):
+            refusals.append("")
+        except Exception as error:  # noqa: BLE001 - a foreign module may raise anything
+            refusals.append(f"{[1, *shape]} ({last_line(error)})")
+    if all(refusals):
+        state, image = refusals
+        raise PolicyError(
+            f"{call.name}: its {first} takes neither a state {state} nor an image {image}"
+        )
+    if not any(refusals) and not is_state:
         raise PolicyError(
             f"{call.name}: its {first or 'input'} may be a state or an image, it takes both: call "
             f'it so, or write "inputs": {{"state": "{first}"}} into policy.json'
         )
-    return accepted == [True, False]
+    return not refusals[0]
 
 
 def _has_forward(holder: object) -> bool:
@@ -295,7 +300,8 @@ class _Call:
 
     def require_order(self) -> None:
         """Raise PolicyError if an argument has the usual name of another role than its own."""
-        if not is_ordered([""] * self.skip + list(self.names), self._roles):
+        told = ["" if name.startswith("obs") else name for name in self.names]  # any may be one
+        if not is_ordered([""] * self.skip + told, self._roles):
             raise PolicyError(
                 f"{self.name}: its {self._result} is made from {', '.join(self._roles)}, passed "
                 f"in this order, but the arguments are {', '.join(self.names)}: reorder or rename "

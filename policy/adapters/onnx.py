@@ -156,13 +156,13 @@ class GraphFile:
         return pairs
 
     def _role(self, port: "ov.Output", wanted: Mapping[str, Wanted], *, is_alone: bool) -> str:
-        names = port.get_names()
+        names, rank = port.get_names(), port.get_partial_shape().rank
+        by_axes = _ALONE.get(rank.get_length(), "") if rank.is_static else ""
         for role, each in wanted.items():
             if names & set(each.names):
-                return role
-        rank = port.get_partial_shape().rank
-        by_axes = _ALONE.get(rank.get_length(), "") if is_alone and rank.is_static else ""
-        if by_axes in wanted:
+                is_image = role == "state" and by_axes == "image"  # an "obs" may be either
+                return by_axes if is_image and by_axes in wanted else role
+        if is_alone and by_axes in wanted:
             return by_axes
         known = {role: list(each.names) for role, each in wanted.items()}
         raise CheckpointError(

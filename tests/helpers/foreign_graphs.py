@@ -24,7 +24,7 @@ image_width = {IMAGE_PX}
 image_mean_rgb = [0.0, 0.0, 0.0]
 image_std_rgb = [1.0, 1.0, 1.0]
 """
-Shape = Sequence[int]
+Shape = Sequence[int | str]
 FLOAT = TensorProto.FLOAT
 
 
@@ -114,16 +114,20 @@ def recurrent(
 
 
 def image_actor(
-    path: Path, *, kind: int = FLOAT, shape: Shape = (1, 3, IMAGE_PX, IMAGE_PX)
+    path: Path,
+    *,
+    kind: int = FLOAT,
+    shape: Shape = (1, 3, IMAGE_PX, IMAGE_PX),
+    name: str = "image",
 ) -> None:
     """Write a policy: image of any type and shape -> actions [1, 4], the mean pixel value."""
     nodes = [
-        helper.make_node("Cast", ["image"], ["pixels"], to=FLOAT),
+        helper.make_node("Cast", [name], ["pixels"], to=FLOAT),
         helper.make_node("ReduceMean", ["pixels"], ["mean"], keepdims=0),
         helper.make_node("Mul", ["unit", "mean"], ["actions"]),
     ]
     weights = {"unit": np.ones((1, 4), np.float32)}
-    save_graph(path, nodes, {"image": (kind, shape)}, {"actions": (FLOAT, (1, 4))}, weights)
+    save_graph(path, nodes, {name: (kind, shape)}, {"actions": (FLOAT, (1, 4))}, weights)
 
 
 class StateActor(nn.Module):

@@ -177,10 +177,18 @@ class ImageAsObs(nn.Module):
         return (torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)
 
 
-def test_an_argument_is_what_the_description_calls_it(tmp_path: Path) -> None:
-    path = archive(tmp_path, ImageAsObs(), described(inputs={"image": "obs"}))
+@pytest.mark.parametrize("inputs", [{"image": "obs"}, {}])
+def test_an_observation_that_only_an_image_fits_is_one(tmp_path: Path, inputs: object) -> None:
+    path = archive(tmp_path, ImageAsObs(), described(inputs=inputs))
     runner = load(f"torchscript:{path}", engine="torch", dual_rate=False).runner
     assert act(runner, level=255)[0, 0] > act(runner, level=0)[0, 0]
+
+
+def test_an_input_that_fits_nothing_is_refused_with_both_reasons(tmp_path: Path) -> None:
+    path = archive(tmp_path, torch.jit.script(nn.Linear(13, 4).half()), described())
+    said = r"input takes neither a state \[1, 13\] \(.*same dtype.*nor an image \[1, 3, 32, 32\] \("
+    with pytest.raises(PolicyError, match=said):
+        load(f"torchscript:{path}", dual_rate=False)
 
 
 class StateFirst(nn.Module):

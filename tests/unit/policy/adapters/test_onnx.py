@@ -316,6 +316,15 @@ def test_the_element_type_says_what_a_pixel_is(tmp_path: Path, kind: int, white:
         assert act(runner, level=level)[0] == pytest.approx([white * level / 255] * 4, rel=5e-3)
 
 
+@pytest.mark.parametrize("shape", [(1, 3, 32, 32), ("batch", 3, "height", "width")])
+def test_an_observation_of_four_axes_is_an_image(
+    tmp_path: Path, shape: tuple[int | str, ...]
+) -> None:
+    graphs.write_contract(tmp_path)
+    graphs.image_actor(tmp_path / "policy.onnx", name="obs", shape=shape)
+    assert act(fly(f"onnx:{tmp_path}"), level=255)[0] == pytest.approx([1.0] * 4, rel=5e-3)
+
+
 def external(folder: Path, change: Callable[[Path], object]) -> None:
     graphs.actor(folder / "policy.onnx", external=True)
     change(folder / "policy.onnx.data")
