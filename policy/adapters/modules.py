@@ -252,6 +252,17 @@ def _has_forward(holder: object) -> bool:
     return isinstance(holder, nn.Module) and type(holder).forward is not nn.Module.forward
 
 
+def _unwrapped(function: Any) -> Any:
+    """Return the module inside those of torch.compile and data parallelism, which declare no
+    arguments of their own."""
+    while True:
+        is_parallel = isinstance(function, nn.DataParallel)
+        inner = function.module if is_parallel else getattr(function, "_orig_mod", None)
+        if inner is None:
+            return function
+        function = inner
+
+
 def _is_training(batch_norm: Any) -> bool:
     """True if a graph's batch norm is fixed in training mode; without averages it has only one."""
     _, _, _, average, _, is_training, *_ = batch_norm.inputs()
@@ -279,7 +290,8 @@ class _Call:
         self._result, self._pick = result, description.outputs.get(result)
         self.skip = 0
         """Leading arguments to drop: 1 for a policy that takes no image."""
-        called = function.forward if isinstance(function, nn.Module) else function
+        inner = _unwrapped(function)
+        called = inner.forward if isinstance(inner, nn.Module) else inner
         schema = getattr(called, "schema", None)  # of TorchScript
         takes_any = False
         if schema is not None:
@@ -314,14 +326,16 @@ class _Call:
         if isinstance(values, Sequence):
             values = dict(enumerate(values))
         if isinstance(values, Mapping):
-            if self._pick not in values:
+            only = next(iter(values)) if len(values) == 1 else None
+            pick = only if self._pick is None else self._pick
+            if pick not in values:
                 raise PolicyError(
                     f"{self.name}: it returns {len(values)} values "
-                    f"({', '.join(map(str, values))}): say which "
-                    f'is the {self._result}, in policy.json, "outputs": {{"{self._result}": '
+                    f"({', '.join(map(str, values))}): return the {self._result} alone, or say in "
+                    f'an archive\'s policy.json which it is, "outputs": {{"{self._result}": '
                     f"{json.dumps(next(iter(values), 0))}}}"
                 )
-            returned = values[self._pick]
+            returned = values[pick]
         if not isinstance(returned, Tensor):
             raise PolicyError(
                 f"{self.name}: its {self._result} is a {type(returned).__name__}, not a tensor"

@@ -400,6 +400,29 @@ class NamedHead:
         self.visual_encoder, self.action_head = whole.visual_encoder, whole.head
 
 
+class SettableHead(Head):
+    def forward(  # type: ignore[override]
+        self, feature: Tensor, state: Tensor, scale: float = 1.0
+    ) -> dict[str, Tensor]:
+        history = torch.zeros(len(state), *SINGLE.history_shape)
+        return {"actions": super().forward(feature, state, history) * scale}
+
+
+class NamedSettableHead(NamedHead):
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(6)
+            self.action_head: nn.Module = SettableHead()
+
+
+class WrappedHead(NamedSettableHead):
+    def __init__(self) -> None:
+        super().__init__()
+        compiled: Any = torch.compile(self.action_head, backend="eager")
+        self.action_head = nn.DataParallel(compiled)
+
+
 class NoisyHead(Head):
     """Head that is one step of a diffusion policy, with arguments in a denoiser's order."""
 

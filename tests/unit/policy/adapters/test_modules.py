@@ -145,6 +145,14 @@ def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(act(runner)[0, 0] + 0.5, abs=1e-3)
 
 
+def test_wrapped_modules_get_the_arguments_that_they_declare() -> None:
+    plain, wrapped = (
+        load(f"{MINE}:{name}", engine="torch").runner
+        for name in ("NamedSettableHead", "WrappedHead")
+    )
+    require_same(plain, wrapped)
+
+
 class Flattening(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return torch.zeros(1, 8, 4) + x.flatten()[0]
