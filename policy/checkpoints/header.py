@@ -29,6 +29,11 @@ _FOLDERS: tuple[tuple[str, str, str], ...] = (
     ("*.onnx", "a folder of ONNX models", "fly it with --policy onnx:{0}"),
 )
 """Entry of a folder, the folder's kind, and the next step."""
+_ARCHIVES = {
+    "archive_format": "a program of torch.export",
+    "_stable_baselines3_version": "a model of Stable-Baselines3",
+}
+"""File in a zip archive, and the archive's kind."""
 CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"
 TRAINING_KEY = "training"
@@ -70,6 +75,9 @@ def _zip(path: Path) -> tuple[str, str] | None:
             names = archive.namelist()
             if any("/code/" in name or name.endswith("/constants.pkl") for name in names):
                 return "a TorchScript archive", f"fly it with --policy torchscript:{path}"
+            for sign, what in _ARCHIVES.items():
+                if any(name.rpartition("/")[2] == sign for name in names):
+                    return what, "write ONNX by torch.onnx.export, and fly --policy onnx:FILE"
             is_torch = any(name.endswith("data.pkl") for name in names)
             return None if is_torch else ("a zip archive", "unpack it, and name what is in it")
     except (zipfile.BadZipFile, ValueError):

@@ -56,6 +56,12 @@ FILES: list[tuple[str, Callable[[], bytes], str]] = [
         r"TorchScript archive.*torchscript:.*\.pt",
     ),
     ("m.zip", lambda: zipped("a/weights.bin"), "a zip archive: unpack"),
+    ("m.pt2", lambda: zipped("m/archive_format"), r"a program of torch\.export: .*--policy onnx:"),
+    (
+        "m.zip",
+        lambda: zipped("policy.pth", "_stable_baselines3_version"),
+        r"a model of Stable-Baselines3: .*--policy onnx:",
+    ),
     (TORCH, lambda: saved(tensors("a"))[:300], "cut short, or damaged"),
     (
         SAFETENSORS,
