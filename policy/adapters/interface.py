@@ -191,6 +191,8 @@ def read_tables(path: Path) -> dict[str, Any]:
         raise ContractError(f"--contract {path}: {error.strerror}") from error
     except ValueError as error:
         raise ContractError(f"--contract {path} is not TOML: {error}") from error
+    if not data:
+        raise ContractError(f"--contract {path} says nothing: draft it by mavbridge contract")
     if loose := [name for name, entries in data.items() if not isinstance(entries, dict)]:
         raise ContractError(f"--contract {path}: {loose} must stand in a table, as in [contract]")
     if unanswered := [

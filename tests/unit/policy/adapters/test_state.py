@@ -105,3 +105,12 @@ def test_an_entry_of_another_type_is_refused_by_its_name(entry: str, tmp_path: P
     table, name = entry.replace("\n", " ").split()[:2]
     with pytest.raises(ContractError, match=rf"{re.escape(table)} {name} must be a (list|text)"):
         read_interface(path)
+
+
+@pytest.mark.parametrize("text", ["", "\n# horizon = 8\n"])
+def test_a_contract_file_that_says_nothing_is_refused(text: str, tmp_path: Path) -> None:
+    """As a copy of none of its bytes: every term would be a default, and fly."""
+    path = tmp_path / "contract.toml"
+    path.write_text(text)
+    with pytest.raises(ContractError, match="says nothing: draft it by mavbridge contract"):
+        read_interface(path)
