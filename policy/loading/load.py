@@ -23,7 +23,13 @@ from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import builtin_checkpoint, load_builtin, parse_builtin
-from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract, measure_times
+from policy.loading.request import (
+    LoadedPolicy,
+    PolicyRequest,
+    default_contract,
+    measure_times,
+    unit_notes,
+)
 from policy.motion.scripted import IN_AIR, ScriptedPolicy, make_scripted
 from policy.motion.stick_loop import by_rates, flown_by_rates
 from policy.nets.names import BUILTIN_KINDS
@@ -107,14 +113,14 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
         runner, engine_notes = (make_runner or partial(_on_engine, policy, request))(settings)
         if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)
-        times = measure_times(runner, now_s)
+        times, doubts = measure_times(runner, now_s), unit_notes(runner)
         runner.reset()  # forget the dummy samples
     except BaseException:
         with suppress(PolicyError):
             close()
         raise
     runner = replace(runner, close=close)
-    return LoadedPolicy(runner=runner, notes=(*notes, *engine_notes), times=times)
+    return LoadedPolicy(runner=runner, notes=(*notes, *engine_notes, *doubts), times=times)
 
 
 def _settings(

@@ -1,19 +1,32 @@
 """The requested policy, and the loaded policy with its measured times."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from policy.contract import Contract
+import numpy as np
+
+from policy.adapters.interface import ACTION_FIELDS
+from policy.contract import ACTION_DIM, QUATERNION, RATE, VELOCITY, ActionKind, Contract
 from policy.engines.runner import EngineName, dummy_sample, encode_all
-from policy.errors import NoChunkError, PolicyError
+from policy.errors import NoChunkError, PolicyError, warned
 from policy.protocol import PolicyRunner
 
 REPETITIONS = 5
 MOST_S = 0.5
 """Stop repeating after this time: one run is enough to know that a policy is slow."""
+
+
+_MOST: dict[ActionKind, tuple[float, ...]] = {
+    "sticks": (10.0, 10.0, 10.0, 10.0),
+    "rates": (10.0, 20.0, 20.0, 20.0),
+    "attitude": (10.0, math.pi, math.pi, 20.0),
+    "velocity": (100.0, 100.0, 100.0, 20.0),
+}
+"""Larger actions are in another unit: degrees, per cent, cm/s, microseconds of a pulse."""
 
 
 class SolveTimes(NamedTuple):
@@ -43,6 +56,28 @@ def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTime
         encode_s.append((encoded_s - before_s) / contract.observation_steps)
         act_s.append(now_s() - encoded_s)
     return SolveTimes(encode_s=median(encode_s), act_s=median(act_s))
+
+
+def unit_notes(runner: PolicyRunner) -> tuple[str, ...]:
+    """Return a warning if the actions for a moving vehicle cannot be in the contract's units."""
+    images, state, history = dummy_sample(runner.contract)
+    state[..., VELOCITY], state[..., RATE] = 2.0, 0.5
+    state[..., QUATERNION] = (0.96, 0.28, 0.0, 0.0)
+    try:
+        chunk = runner.act(encode_all(runner, images), state, history)
+    except PolicyError:
+        return ()  # it need not know this state
+    largest = np.abs(chunk.reshape(-1, ACTION_DIM)).max(axis=0)
+    kind = runner.contract.action
+    found = [
+        f"{name} {value:.4g}"
+        for name, value, most in zip(ACTION_FIELDS[kind], largest, _MOST[kind], strict=True)
+        if value > most
+    ]
+    if not found:
+        return ()
+    told = f"its {kind} reach {', '.join(found)}, far beyond any that fly, and would be clipped"
+    return (warned(f"{told}: are they in the contract's units?"),)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from helpers.loaded_policies import act, load
 from policy.checkpoints.networks import save_checkpoint
 from policy.contract import Contract, FloatArray
 from policy.engines.runner import level_state
-from policy.errors import NoChunkError, PolicyError
+from policy.errors import NoChunkError, PolicyError, Warned
 from policy.loading.load import read_policy_contract
 from policy.loading.request import PolicyRequest, measure_times
 from policy.motion.stick_loop import StickLoop, by_rates
@@ -153,3 +153,38 @@ def test_a_policy_is_timed_by_the_median_of_as_few_chunks_as_tell(
     else:
         assert (told.encode_s, told.act_s) == pytest.approx((encode_s, told_s))
     assert list(times) == [], "asked as often as that"
+
+
+UNITS = """
+import numpy as np
+from policy.contract import Contract
+
+class Mine:
+    contract = Contract(arrays="numpy", horizon=2, action="{action}")
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        forward, rate = state[0, 0], state[0, 7]
+        return np.tile(np.array([{actions}], np.float32), (1, 2, 1))
+"""
+
+
+@pytest.mark.parametrize(
+    ("action", "actions", "told"),
+    [
+        ("sticks", "1500, 1500, 1500 + forward, 1500", "reach throttle 1500, yaw 1500, pitch 1502"),
+        ("sticks", "0, 0, 50 * forward, 0", "its sticks reach pitch 100, far beyond"),
+        ("sticks", "0, 0, forward, -2 * forward", None),
+        ("attitude", "0.4, 5 * forward, 0, 0", "its attitude reach roll_rad 10"),
+        ("attitude", "0.4, 0.2 * forward, 0, 0", None),
+        ("rates", "0.4, 57 * rate, 0, 0", "its rates reach roll_rate_radps 28.5"),
+        ("rates", "0.4, 4 * rate, 0, 0", None),
+        ("velocity", "100 * forward, 0, 0, 0", "its velocity reach vx_mps 200"),
+        ("velocity", "2 * forward, 0, 0, 0", None),
+    ],
+)
+def test_actions_of_another_unit_are_warned_of(tmp_path, action, actions, told):
+    """A level vehicle at rest does not show degrees: zero is zero in all units."""
+    (tmp_path / "mine.py").write_text(UNITS.format(action=action, actions=actions))
+    warnings = [note for note in load(f"{tmp_path / 'mine.py'}:Mine").notes if "units" in note]
+    assert len(warnings) == (told is not None)
+    assert told is None or (isinstance(warnings[0], Warned) and told in warnings[0])
