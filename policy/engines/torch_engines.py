@@ -4,6 +4,7 @@ And what a user's policy holds: its modules, and the attributes that change from
 """
 
 import copy
+import gc
 import hashlib
 import re
 import sys
@@ -11,7 +12,6 @@ from collections import UserDict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import _lru_cache_wrapper, partial
-from gc import get_referents
 from io import IOBase
 from itertools import count, islice
 from queue import Queue
@@ -209,7 +209,7 @@ def _attributes(holder: object) -> dict[str, object]:
     """Return the elements of a collection, and the attributes of an object and of its class."""
     items: Iterable[tuple[object, object]] = ()
     if isinstance(holder, _COLLECTIONS):
-        items = holder.items() if isinstance(holder, dict) else enumerate(get_referents(holder))
+        items = holder.items() if isinstance(holder, dict) else enumerate(gc.get_referents(holder))
     elements = {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
     attributes = _reached(holder) if isinstance(holder, FunctionType) else {}
     kinds = holder.__mro__ if isinstance(holder, type) else type(holder).__mro__
@@ -241,7 +241,7 @@ def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
 def outside_calls() -> Iterator[set[str]]:
     """Context manager: yield the names, complete at its end, of this thread's calls that read a
     clock, file, socket or lock."""
-    names, before = set[str](), sys.getprofile()
+    names, before, collects = set[str](), sys.getprofile(), gc.isenabled()
 
     def note(_frame: object, event: str, called: Any) -> None:
         if event == "c_call":
@@ -250,11 +250,14 @@ def outside_calls() -> Iterator[set[str]]:
             if (getattr(called, "__module__", None) or kind.__module__) in _OUTSIDE:
                 names.add(called.__name__)
 
+    gc.disable()  # a collection would call what is none of the policy's
     sys.setprofile(note)
     try:
         yield names
     finally:
         sys.setprofile(before)
+        if collects:
+            gc.enable()
 
 
 def _mark(value: object) -> object:
