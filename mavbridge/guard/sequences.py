@@ -263,21 +263,22 @@ class DisengageSequence:
         """Return why the pilot's sticks would not hold the vehicle in its present mode, or None."""
         if now.status.has_receiver is not True:
             return because(Code.NO_RECEIVER)
-        if now.status.is_landed:
-            return None
+        pilot, is_thrust = now.status.pilot_sticks, now.status.mode in now.link.modes.thrust
+        lifts_from = -MIDDLE_STICK if is_thrust else MIDDLE_STICK
+        if now.status.is_landed and (pilot is None or pilot.throttle <= lifts_from):
+            return None  # it stays there
         # The silence of the whole vehicle tells nothing about its receiver.
         is_heard = now.heard_ns is None or now.now_ns - now.heard_ns <= GAP_NS / 2
         if now.status.is_receiver_sick or (is_heard and not any(now.status.rc_channels_us)):
             return because(Code.RECEIVER_LOST)
         if now.link.modes.is_silence_failsafe and not self.settings.is_setpoint:
             return because(Code.SILENCE_IS_FAILSAFE)
-        if now.status.mode in now.link.modes.thrust:
+        if is_thrust:
             return because(Code.THROTTLE_IS_THRUST, mode=now.status.mode)
-        if now.status.pilot_sticks is None:
+        if pilot is None:
             return because(Code.THROTTLE_UNKNOWN)
-        throttle = now.status.pilot_sticks.throttle
-        if abs(throttle) > MIDDLE_STICK:
-            percent, most = 100 * throttle, 100 * MIDDLE_STICK
+        if abs(pilot.throttle) > MIDDLE_STICK:
+            percent, most = 100 * pilot.throttle, 100 * MIDDLE_STICK
             return because(Code.THROTTLE_RESTS, percent=percent, limit_percent=most)
         return None
 

@@ -82,6 +82,11 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
         (IDLE_RECEIVER, {"then": "auto"}, "LAND"),
         (IDLE_RECEIVER, {"then": "release"}, "LAND"),
         (altered(IDLE_RECEIVER, is_landed=True), {"then": "auto"}, None),
+        # on the ground, with a throttle that would lift it
+        (altered(throttle_at(0.2), is_landed=True), {"then": "auto"}, None),
+        (altered(throttle_at(0.21), is_landed=True), {"then": "auto"}, "LAND"),
+        (altered(throttle_at(0.21), is_landed=True), {"on_fault": "release"}, "BRAKE"),
+        (altered(AIRBORNE, pilot_sticks=None, is_landed=True), {"then": "auto"}, None),
         (NO_RECEIVER, {"then": "auto"}, "LAND"),
         (NO_RECEIVER, {"then": "release"}, "LAND"),
         (altered(NO_RECEIVER, is_landed=True), {"then": "release"}, "LAND"),
@@ -317,10 +322,17 @@ def test_where_px4_may_take_a_jump_to_neutral_for_a_hand_the_throttle_stays() ->
     assert {move.control for move in stepped.run(1.0, mode="AUTO.LOITER")} == {LEVEL}
 
 
-def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
-    stepped = flying(altered(MIDDLE, mode="STABILIZE", is_landed=True), modes=("STABILIZE",))
+@pytest.mark.parametrize(
+    ("throttle", "last", "mode"), [(-0.2, [RELEASE] * 2, None), (-0.19, [LEVEL] * 2, "BRAKE")]
+)
+def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground_to_a_low_one(
+    throttle: float, last: list[ControlSource], mode: str | None
+) -> None:
+    facts = altered(throttle_at(throttle), mode="STABILIZE", is_landed=True)
+    stepped = flying(facts, modes=("STABILIZE",))
     moves = [stepped.step(**FAULT), *stepped.run(0.06)]
-    assert [move.control for move in moves] == [LEVEL] * 5 + [RELEASE] * 2
+    assert [move.control for move in moves] == [LEVEL] * 5 + last
+    assert moves[0].mode == mode
 
 
 # --- PX4, which sees neither our sticks nor the pilot's for a moment after the release
