@@ -116,7 +116,12 @@ def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
 
 def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """the key `q`, or the first stop after a fault"""
-    return stopped(m, now) if m.must_stop or m.act == "release" else None
+    if m.act == "release":
+        return EndRequest(because(Code.OPERATOR), end="operator")
+    request, roles = m.end_request, now.link.modes
+    if request is not None and request.is_fault and m.disengage.mode in (roles.land, roles.rtl):
+        return None  # a fault must not stop a landing or a return
+    return request if m.must_stop else None
 
 
 def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:

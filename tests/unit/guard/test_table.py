@@ -109,6 +109,15 @@ def holding(**settings: Any) -> Stepped:
     return stepped
 
 
+def landing(stop: EndRequest | None) -> Stepped:
+    """By the key, without a receiver; a stop has come since."""
+    stepped = flying(NO_RECEIVER)
+    stepped.step("release")
+    stepped.run(0.2, mode="LAND")
+    stepped.step(stop=stop)
+    return stepped
+
+
 def held_by_px4(mode: str) -> Stepped:
     """In this mode, after a fault without a receiver; ``on_fault`` has asked for it."""
     facts = altered(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
@@ -426,6 +435,14 @@ CASES = {
     "key while holding": Case(holding, KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
     "first stop while holding": Case(holding, {"stop": SIGNAL}, LEAVING, NEUTRAL, "LAND",
         Code.SIGNAL),
+    "death while it lands": Case(partial(landing, DEATH), {}, HOLDING, NEUTRAL, why=Code.OPERATOR),
+    "key after a death while it lands": Case(partial(landing, DEATH), KEY, LEAVING, NEUTRAL,
+        why=Code.OPERATOR),
+    "signal while it lands": Case(partial(landing, None), {"stop": SIGNAL}, LEAVING, NEUTRAL,
+        why=Code.SIGNAL),
+    "death while it hovers after a stop": Case(lambda: after(lambda: after(partial(flying,
+        NO_RECEIVER, then="hold", on_fault="land"), 0.01, act="release"), 0.2, mode="BRAKE",
+        act=None), {"stop": DEATH}, LEAVING, NEUTRAL, "LAND", DEATH.reason.code),
     "second stop while holding": Case(lambda: after(lambda: after(partial(flying, NO_RECEIVER),
         0.01, stop=DEATH), 0.2, mode="BRAKE"), {"stop": SIGNAL}, HOLDING, NEUTRAL,
         why=DEATH.reason.code),
