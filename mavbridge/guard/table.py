@@ -128,10 +128,10 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
     The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
-    was disarmed, rebooted, is in a failsafe that changes the mode (PX4: any) or follows other
-    sticks; the override switch is low (setpoints ignore it); the engage switch is low (in flight or
-    while engaging; PX4: while held); the vehicle is silent while another one uses its system id; or
-    a relevant parameter was changed.
+    was armed in another mode, disarmed, rebooted, is in a failsafe that changes the mode (PX4: any)
+    or follows other sticks; the override switch is low (setpoints ignore it); the engage switch is
+    low (in flight or while engaging; PX4: while held); the vehicle is silent while another one uses
+    its system id; or a relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -328,6 +328,9 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         has_come_down = now.status.is_landed and m.own_mode in (roles.land, roles.rtl)
         if has_come_down and m.phase in (LEAVING, HOLDING) and roles.needs_setpoints_first:
             changed = because(Code.LANDED)  # PX4 shows this change 4 ms before its disarming
+    if m.own_mode is None and now.status.armed:  # we arm in our own mode only
+        allowed = " or ".join(m.settings.modes)
+        changed = because(Code.WRONG_MODE, mode=now.status.mode, allowed=allowed)
     # The flag of a failsafe that kept our mode stays up, and does not tell who changes the mode.
     codes = m.reason.codes if m.phase in (LEAVING, HOLDING) and m.reason is not None else ()
     failsafe = None if Code.FAILSAFE in codes else _failsafe(m, now, keeps_mode=False)
