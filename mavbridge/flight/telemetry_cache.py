@@ -102,8 +102,8 @@ class TelemetryCache:
 
     @property
     def is_airborne(self) -> bool:
-        """True if the policy flies and the vehicle reports that it is not landed."""
-        return self.phase is Phase.FLYING and self.status.is_landed is False
+        """True if the vehicle is armed, and reports that it is not landed."""
+        return self.status.armed and self.status.is_landed is False
 
     def take_past(self, until_ns: int) -> list[Telemetry]:
         """Return the telemetry at each attitude since the last call, up to arrival ``until_ns``."""

@@ -59,8 +59,8 @@ class VisionLoop:
                 policy has to be ready for two threads.
             image_watch: judges each encoded frame; None where the policy looks at no image, or the
                 renderer draws none.
-            is_airborne: whether the policy flies and the vehicle is known not to be landed; a
-                frozen image is a fault only then. Called from this loop's thread.
+            is_airborne: whether the vehicle is known to be in the air; a frozen image is a fault
+                only then. Called from this loop's thread.
             number: place of the camera in the contract.
         """
         self._camera = camera

@@ -23,11 +23,6 @@ vehicle's own sticks are mapped."""
 class PilotView(TelemetryCache):
     """``TelemetryCache`` of a vehicle that its pilot flies."""
 
-    @property
-    def is_airborne(self) -> bool:
-        """True if the pilot flies: the vehicle is armed and not landed."""
-        return self.status.armed and self.status.is_landed is False
-
     def _join(self, sent: GuardTick) -> Tick:
         """Return a tick of the pilot's, since no policy flies."""
         return replace(super()._join(sent), release_reason=PILOTS, phase="released")

@@ -152,12 +152,12 @@ def test_a_vehicle_stays_found_while_a_reboot_hides_its_mode() -> None:
     assert Viewed().receive(unknown._replace(mode="LOITER"), unknown).view.is_found
 
 
-def test_it_is_airborne_while_the_policy_flies_and_the_vehicle_says_so() -> None:
+def test_an_armed_vehicle_is_airborne_if_it_says_so_whoever_flies_it() -> None:
     airborne = GuardStatus("ArduPilot", "ALT_HOLD", True, False, (), None)
-    assert Viewed().receive(airborne, TICK).view.is_airborne
-    assert not Viewed().receive(airborne, NOBODY).view.is_airborne
-    for is_landed in (True, None):
-        status = airborne._replace(is_landed=is_landed)
+    for tick in (TICK, NOBODY):
+        assert Viewed().receive(airborne, tick).view.is_airborne
+    for change in ({"is_landed": True}, {"is_landed": None}, {"armed": False}):
+        status = airborne._replace(**change)
         assert not Viewed().receive(status, TICK).view.is_airborne
 
 
