@@ -46,8 +46,7 @@ _END_BY_REASON: dict[Code, FlightEnd] = {
     Code.OPERATOR: "operator",
     Code.SIGNAL: "signal",
     Code.DISARMED: "disarmed",
-    **dict.fromkeys((Code.FAILSAFE, Code.REBOOTED, Code.CLOCK_SET_BACK), "takeover"),
-    **dict.fromkeys((Code.MOVED, Code.REPLACED), "takeover"),
+    **dict.fromkeys((Code.FAILSAFE, Code.REBOOTED, Code.REPLACED), "takeover"),
 }
 """Ends by reason. Other reasons: a takeover if they are the pilot's, else a fault."""
 

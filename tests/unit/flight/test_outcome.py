@@ -216,6 +216,7 @@ def test_a_second_flight_has_a_reason_of_its_own() -> None:
         *((Code.DISARMED, "disarmed"), (Code.OVERRIDE_SWITCH_OFF, "takeover")),
         *((code, "takeover") for code in (Code.FAILSAFE, Code.REBOOTED, Code.REPLACED)),
         *((Code.POLICY_FAILED, "fault"), (Code.CONNECTION_LOST, "fault")),
+        *((Code.CLOCK_SET_BACK, "fault"), (Code.MOVED, "fault")),  # as the guard counts them
     ],
 )
 def test_without_a_summary_the_reason_tells_the_end(code: Code, end: FlightEnd) -> None:
