@@ -280,50 +280,6 @@ def test_a_pilot_who_chooses_hold_in_that_failsafe_keeps_it() -> None:
     assert flight.px4.mode_name == "AUTO.LOITER", flight.describe()
 
 
-def test_a_failsafe_that_is_not_of_the_sticks_is_left_alone_after_a_release() -> None:
-    """A geofence or a battery may bring it just then."""
-    flight = OutputFlight("px4", "sticks")
-    fall_back(flight, 1500, 1500, 1500, 1500)
-    flight.fly(1.2)
-    flight.act("release")
-    flight.run(0.3)
-    flight.px4.lost_sticks.start()  # ends in RTL, as they may
-    flight.run(1.5)
-    assert (flight.px4.mode_name, flight.codes) == ("AUTO.LOITER", (Code.OPERATOR,))
-
-
-def test_the_failsafe_of_a_dead_receiver_is_left_alone_after_a_takeover_to_hold() -> None:
-    """PX4 grants Hold without sticks: asked for by us again, it ended the failsafe, and no RTL."""
-    flight = OutputFlight("px4", "sticks")
-    fall_back(flight, 1500, 1500, 1500, 1500)
-    flight.fly(1.2)
-    flight.vehicle.set_receiver(())
-    flight.pilot_changes_mode()
-    flight.run(7.0)
-    assert flight.codes == (Code.MODE_CHANGED,)
-    assert flight.px4.mode_name == "AUTO.RTL", flight.describe()
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), MESSAGES)
-def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind).fly(1.2)
-    at_s, at_ns = flight.t_s, flight.clock.now_ns()
-    mode = flight.pilot_changes_mode()
-    flight.until(lambda: flight.phase in (Phase.RELEASING, Phase.RELEASED), within_s=0.06)
-    heard_ns = flight.clock.now_ns()
-    flight.run(1.5)
-    found = flight.aftermath(at_s)
-    assert found.mode == mode
-    assert found.mode_ms is not None
-    assert found.mode_ms < 10
-    assert not found.flew_again
-    assert flight.phase is Phase.RELEASED
-    assert not flight.modes_asked(at_ns), "the guard never changes the pilot's mode"
-    if kind != "sticks":
-        names = {m.get_type() for _, m in flight.left(heard_ns + 1)}
-        assert not names & {"SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED"}, "silence"
-
-
 @pytest.mark.parametrize(("autopilot", "kind"), MESSAGES)
 def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_never_again(
     autopilot: AutopilotName, kind: ActionKind
@@ -384,14 +340,3 @@ def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_he
     assert flight.phase is Phase.HOLDING, flight.describe()
     assert flight.samples[-1].mode == "AUTO.LOITER"
     assert not any(s.failsafe for s in flight.samples)
-
-
-@pytest.mark.parametrize("phase_ms", [150, 810])
-def test_a_takeover_on_px4_without_current_mode_is_seen_within_100_ms(phase_ms: int) -> None:
-    """Its HEARTBEAT comes once a second: 204 to 947 ms of the policy's actions, by its phase."""
-    old = replace(NOMINAL_VEHICLE, px4_release="1.14")
-    flight = OutputFlight("px4", "rates", vehicle=old).fly(1.5 + phase_ms / 1000)
-    flight.pilot_changes_mode()
-    began_s = flight.now_s
-    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=2.0)
-    assert flight.now_s - began_s <= 0.1

@@ -26,7 +26,6 @@ from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.replay.compare import (
     PAST_INPUTS,
-    PolicyComparison,
     compare_guard,
     compare_policy,
 )
@@ -122,22 +121,12 @@ class Flown:
 def flown_and_repeated(
     monkeypatch: pytest.MonkeyPatch,
     make: Callable[[], PolicyRunner],
+    other: Callable[[], PolicyRunner] | None = None,
     *,
     goal: str | None = None,
     autopilot: AutopilotName = "ardupilot",
-) -> PolicyComparison:
-    """A short flight, and every solve of it once more."""
-    return compare_policy(flown_and_paired(monkeypatch, make, make, goal, autopilot))
-
-
-def flown_and_paired(
-    monkeypatch: pytest.MonkeyPatch,
-    make: Callable[[], PolicyRunner],
-    other: Callable[[], PolicyRunner],
-    goal: str | None = None,
-    autopilot: AutopilotName = "ardupilot",
 ) -> list[SolvePair]:
-    """A short flight, and every solve of it once more, by the other policy."""
+    """A short flight, and every solve of it once more, or by the other policy."""
     flown, loops = Flown(), simulation.vision_loops
 
     def recorded(*arguments: Any, sinks: list[TickSink], **named: Any) -> Any:
@@ -159,18 +148,13 @@ def flown_and_paired(
     one.fly(runner, max_time_s=FLIGHT_S, sinks=(flown.sink,))
     source = flown.source(runner, goal)
     clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
-    return list(replay_policy(source, other(), clock, source.features))
+    return list(replay_policy(source, (other or make)(), clock, source.features))
 
 
 def attentive(kind: type[Attentive] = Attentive, **changes: Any) -> Callable[[], PolicyRunner]:
     settings = ExecutionSettings(name="attentive", dual_rate=changes.pop("dual_rate", True))
     contract = replace(BASE, modes=(), **changes)
     return lambda: make_numpy_runner(kind(contract), settings)
-
-
-def assert_equal(compared: PolicyComparison, *, least: int = 50) -> None:
-    assert (compared.missing, compared.inputs_differ) == ({}, {})
-    assert compared.equal_chunks == compared.solves >= least
 
 
 TWO_EYES = {"cameras": ("front", "down"), "camera_rates_hz": (30.0, 10.0)}
@@ -187,22 +171,29 @@ PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
         {"state_extras": ("height",), **TWO_EYES, **PAST},
         {"history_len": 1, "history_dt_s": 0.001},
         {"prefix_len": 4, "history_len": 64, "history_dt_s": 0.003},
+        {"action": "attitude", "state_extras": ("height",)},
+        {"autopilot": "px4", "state_extras": ("height", "altitude")},
+        {"autopilot": "px4", "action": "rates", "state_frame": "enu_flu"},
     ],
     ids=", ".join,
 )
-def test_every_field_of_the_state_is_repeated_bit_for_bit(
+def test_every_input_and_kind_of_action_is_repeated_bit_for_bit(
     monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
-    goal = "5,2,-3" if "goal" in changes.get("state_extras", ()) else None
-    compared = flown_and_repeated(monkeypatch, attentive(**changes), goal=goal)
-    assert_equal(compared)
+    contract = {name: value for name, value in changes.items() if name != "autopilot"}
+    flown = {"autopilot": changes.get("autopilot", "ardupilot")}
+    if "goal" in changes.get("state_extras", ()):
+        flown["goal"] = "5,2,-3"
+    compared = compare_policy(flown_and_repeated(monkeypatch, attentive(**contract), **flown))
+    assert (compared.missing, compared.inputs_differ) == ({}, {})
+    assert compared.equal_chunks == compared.solves >= 50
 
 
 def test_another_policy_is_given_the_past_images_of_its_own_contract(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     newest_only, also_past = attentive(), attentive(observation_steps=2, observation_dt_s=0.3)
-    pairs = flown_and_paired(monkeypatch, newest_only, also_past)
+    pairs = flown_and_repeated(monkeypatch, newest_only, also_past)
     past, newest = np.array([pair.replayed.frame_ids for pair in pairs if pair.replayed])[-10:].T[0]
     assert (newest - past).tolist() == [9] * 10  # 0.3 s at 30 Hz
 
@@ -212,25 +203,10 @@ def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(
 ) -> None:
     """What they saw counts in later past states, and is not recorded: these are taken as given."""
     make = attentive(Hesitant, state_extras=("height",), **PAST)
-    compared = flown_and_repeated(monkeypatch, make)
+    compared = compare_policy(flown_and_repeated(monkeypatch, make))
     assert compared.missing == {}
     assert set(compared.inputs_differ) <= set(PAST_INPUTS)
     assert compared.equal_chunks == compared.solves >= 50
-
-
-@pytest.mark.parametrize(
-    ("autopilot", "changes"),
-    [
-        ("px4", {"state_extras": ("height", "altitude")}),
-        ("px4", {"action": "rates", "state_frame": "enu_flu"}),
-        ("ardupilot", {"action": "attitude", "state_extras": ("height",)}),
-    ],
-)
-def test_every_kind_of_action_is_repeated_bit_for_bit(
-    monkeypatch: pytest.MonkeyPatch, autopilot: AutopilotName, changes: dict[str, Any]
-) -> None:
-    compared = flown_and_repeated(monkeypatch, attentive(**changes), autopilot=autopilot)
-    assert_equal(compared)
 
 
 def hold_and_quit(flight: OutputFlight) -> None:
