@@ -25,15 +25,6 @@ def test_help_of_fly_names_every_flag_of_the_contract() -> None:
     assert missing == []
 
 
-def test_a_flight_that_did_not_begin_leaves_no_folder_and_no_report(tmp_path: Path) -> None:
-    folder, report = tmp_path / "flight", tmp_path / "report.json"
-    flags = ("--connect", "bluetooth", "--record", str(folder), "--report", str(report))
-    status, text = told_by(*flags)
-    assert status == 2
-    assert "HOST:PORT" in text
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
     """Half a second of grey frames."""

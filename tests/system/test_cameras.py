@@ -1,10 +1,9 @@
-"""Two cameras, cameras over the network and of depth, in real processes."""
+"""Two cameras and cameras of depth, in real processes."""
 
 import os
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +12,10 @@ import pytest
 from faults.stage import faulty_policy, staged
 from helpers.camera_senders import (
     SIDE,
-    RtpSender,
-    UdpSender,
     depth_scene,
-    encoded,
     repeating,
-    scene,
 )
 from helpers.status import printed_by
-from mavbridge.commands.check.camera import CameraNeeds, camera_rows
-from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.recording.flight_folder import open_flight
 from policy.data.flight_data import DatasetError
@@ -80,66 +73,26 @@ def depth_policy(tmp_path: Path) -> str:
 
 
 @contextmanager
-def sent(kind: str, folder: Path) -> Iterator[str]:
-    """A source of images by a sender of ours, while it sends; returns what --camera takes."""
-    clock = MonotonicClock()
-    if kind == "rtp":
-        rtp = RtpSender(17241)
-        with repeating(lambda number: rtp.send(scene(number))):
-            yield str(rtp.describe(folder / "camera.sdp"))
-        rtp.close()
-    elif kind == "jpeg-udp":
-        with UdpSender(17240) as sender:
-
-            def send(number: int) -> None:
-                sender.send_raw(b"junk")
-                sender.send(number, encoded(scene(number)), stamp_ns=clock.now_ns() - 10**7)
-
-            with repeating(send):
-                yield "jpeg-udp:17240"
-    else:
-        name = f"mb-test-depth-{os.getpid()}"
-        with (
-            closing(FramePublisher(name, SIDE, SIDE, is_depth=True)) as publisher,
-            repeating(lambda number: publisher.publish(depth_scene(number), clock.now_ns())),
-        ):
-            yield f"shm:{name}"
-
-
-@pytest.mark.parametrize(
-    ("kind", "is_depth", "age_ms"), [("jpeg-udp", False, 10), ("rtp", False, 0), ("shm", True, 0)]
-)
-def test_check_says_rate_and_latency_and_refuses_the_other_kind(
-    tmp_path: Path, kind: str, is_depth: bool, age_ms: float
-) -> None:
-    clock, config = MonotonicClock(), CameraConfig(camera_timeout=20)
-    with sent(kind, tmp_path) as source:
-        need = CameraNeeds(
-            name="", source=source, rate_hz=30, size_px=(32, 32), max_age_s=0.3, is_depth=is_depth
-        )
-        rows = {
-            row.name.removeprefix(source).strip(): row for row in camera_rows([need], config, clock)
-        }
-        (refused,) = camera_rows([replace(need, is_depth=not is_depth)], config, clock)
-    assert "rate" in rows, rows
-    assert float(rows["rate"].found.split()[0]) == pytest.approx(30, abs=3)
-    assert rows["image"].verdict == "go"
-    assert rows["image"].found.endswith("depth") is is_depth
-    assert age_ms <= float(rows["age when read"].found.split()[0]) < age_ms + 30
-    assert refused.verdict == "no-go"
-    assert "image_channels" in refused.advice
+def depth_camera() -> Iterator[str]:
+    """The name of a shared memory with images of depth, at 30 Hz while the context lasts."""
+    name, clock = f"mb-test-depth-{os.getpid()}", MonotonicClock()
+    with (
+        closing(FramePublisher(name, SIDE, SIDE, is_depth=True)) as publisher,
+        repeating(lambda number: publisher.publish(depth_scene(number), clock.now_ns())),
+    ):
+        yield name
 
 
 def test_a_depth_policy_is_flown_and_recorded_and_refused_with_a_camera_of_colour(
     tmp_path: Path, depth_policy: str
 ) -> None:
     fly = (*FLY, "--policy", depth_policy)
-    with staged(tmp_path, renders=False) as flying, sent("shm", tmp_path) as source:
+    with staged(tmp_path, renders=False) as flying, depth_camera() as name:
         status, output = flying.fly(*fly)
         assert status == 2, output
         assert "delivers RGB images of" in output
         assert flying.relay.overrides == []
-        flying._shm = source.removeprefix("shm:")
+        flying._shm = name
         folder = tmp_path / "recording"
         status, output = flying.fly(*fly, "--duration", "3", "--record", str(folder))
     assert status == 0, output

@@ -1,9 +1,7 @@
 """The whole product in real processes over UDP. What is asserted is what happened, not how fast."""
 
 import signal
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,18 +18,6 @@ NEUTRAL = Override(1500, 1500, 1500, 1500)
 RELEASE = Override(0, 0, 0, 0)
 
 
-def is_neutral(override: Override) -> bool:
-    """Centred, but for the steps of the roll channel by which the link hears itself."""
-    return override._replace(roll=1500) == NEUTRAL and 1500 <= override.roll <= 1502
-
-
-def assert_released(overrides: list[Override]) -> None:
-    """The flight ends with neutral, then releases until the vehicle has confirmed one."""
-    first = overrides.index(RELEASE)
-    assert is_neutral(overrides[first - 1])
-    assert set(overrides[first:]) == {RELEASE}
-
-
 def pwm_us(sticks: Sticks) -> Override:
     """The simulated vehicle's calibration: 1000 to 2000 us, pitch forward is below trim."""
     return Override(
@@ -42,71 +28,47 @@ def pwm_us(sticks: Sticks) -> Override:
     )
 
 
-@dataclass(frozen=True)
-class Flown:
-    """One flight that ended in order: what the bridge printed, reported and recorded."""
-
-    overrides: list[Override]
-    output: str
-    report: Any
-    vehicle: Any
-    recording: Path
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """Takes off, holds its altitude, ends after its duration; recorded, with a viewer's file."""
-    folder = tmp_path_factory.mktemp("flight")
-    recording = folder / "recording"
-    with staged(folder, renders=False) as flying:
-        flags = ("--record", str(recording), "--rerun", str(recording / "flight.rrd"))
-        status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "6", *flags)
-    assert status == 0, output
-    overrides = flying.relay.overrides
-    return Flown(overrides, output, flying.report(), flying.vehicle_report(), recording)
-
-
-def test_takes_off_and_holds_its_altitude(flown: Flown) -> None:
-    vehicle = flown.vehicle
-    assert 2.0 < vehicle["max_altitude_m"] < 4.5
-    assert not vehicle["crashed"]
-    assert [entry["mode"] for entry in vehicle["modes"]][:2] == ["STABILIZE", "ALT_HOLD"]
-    assert "Arming motors" in flown.output
-
-
-def test_gives_the_sticks_back_at_the_end(flown: Flown) -> None:
-    assert_released(flown.overrides)
-    assert flown.vehicle["releases"] >= 1
-
-
-def test_reports_what_it_did(flown: Flown) -> None:
-    report = flown.report
-    assert report["mode"] == "dual"
-    assert report["link"]["echo_confirmed"] is True
-    assert report["link"]["sent_overrides"] >= flown.vehicle["overrides"]["count"] > 0
-    assert report["vision"]["frames"] > 0
-    assert report["observer_drops"]["recorder"] == 0
-
-
 def assert_rows_match_frames(back: RecordedFlight) -> None:
     assert sum(1 for _ in back.images()) == back.frames.num_rows > 0
 
 
-def test_the_recording_is_what_happened(flown: Flown) -> None:
-    assert str(flown.recording) in "\n".join(flown.output.splitlines()[-2:])
-    back = open_flight(flown.recording)
+def test_a_flight_holds_its_altitude_gives_the_sticks_back_and_is_reported_and_recorded(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "recording"
+    with staged(tmp_path, renders=False) as flying:
+        flags = ("--record", str(folder), "--rerun", str(folder / "flight.rrd"))
+        status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "6", *flags)
+    assert status == 0, output
+    assert "Arming motors" in output
+    overrides, report, vehicle = flying.relay.overrides, flying.report(), flying.vehicle_report()
+    assert 2.0 < vehicle["max_altitude_m"] < 4.5
+    assert not vehicle["crashed"]
+    assert [entry["mode"] for entry in vehicle["modes"]][:2] == ["STABILIZE", "ALT_HOLD"]
+    # It ends with neutral sticks, but for the steps by which the link hears itself, and releases.
+    first = overrides.index(RELEASE)
+    assert overrides[first - 1]._replace(roll=1500) == NEUTRAL
+    assert 1500 <= overrides[first - 1].roll <= 1502
+    assert set(overrides[first:]) == {RELEASE}
+    assert vehicle["releases"] >= 1
+    assert (report["mode"], report["link"]["echo_confirmed"]) == ("dual", True)
+    assert report["link"]["sent_overrides"] >= vehicle["overrides"]["count"] > 0
+    assert report["observer_drops"]["recorder"] == 0
+
+    assert str(folder) in "\n".join(output.splitlines()[-2:])
+    back = open_flight(folder)
     assert back.meta.finished
     assert (back.meta.policy, back.meta.mode) == ("scripted:hover", "dual")
-    assert back.meta.autopilot == flown.report["autopilot"]
+    assert back.meta.autopilot == report["autopilot"]
     assert back.ticks.num_rows == back.meta.ticks
-    assert back.frames.num_rows == back.meta.frames == flown.report["vision"]["frames"]
+    assert back.frames.num_rows == back.meta.frames == report["vision"]["frames"] > 0
     assert_rows_match_frames(back)
     rows = [row.tick for row in back.tick_rows() if row.tick.sent is not None]
     sent = [pwm_us(tick.sent) for tick in rows if tick.sent is not None]
-    sticks = [override for override in flown.overrides if override != RELEASE]
+    sticks = [override for override in overrides if override != RELEASE]
     assert sent == sticks[-len(sent) :]  # but for a few before the recording began
     assert len(sticks) - len(sent) < 10
-    assert list(logged_overrides(flown.recording / "link.tlog")) == flown.overrides
+    assert list(logged_overrides(folder / "link.tlog")) == overrides
     frame_ids = set(back.frames["frame_id"].to_pylist())
     assert {tick.feature_frame_id for tick in rows} - {None} <= frame_ids
 

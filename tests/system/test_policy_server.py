@@ -365,23 +365,6 @@ def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> No
             assert (contract.modes, contract.play_s, contract.horizon) == (("OFFBOARD",), 2.0, 100)
 
 
-def test_a_served_policy_is_told_that_a_flight_begins() -> None:
-    policy = Echo()
-    runner = make_numpy_runner(policy, ExecutionSettings(name="echo", dual_rate=False))
-    runner = PolicyRunner(**{**vars(runner), "reset": policy.reset})
-    with our_server(runner) as port:
-        remote, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
-        with closing(remote):
-            inputs = sample(runner, 0)
-            remote.predict(*inputs, 10)
-            assert policy.resets == 0
-            remote.reset()
-            remote._timeout_s = PATIENT_S  # type: ignore[attr-defined]
-            remote.predict(*inputs, 10)
-            remote.predict(*inputs, 10)
-            assert policy.resets == 1
-
-
 def test_no_chunk_is_flown_before_a_reset_has_succeeded() -> None:
     policy, failures = Echo(), ["device busy", "device busy"]
 
@@ -395,6 +378,8 @@ def test_no_chunk_is_flown_before_a_reset_has_succeeded() -> None:
         remote, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
         with closing(remote):
             inputs = sample(runner, 0)
+            remote.predict(*inputs, 10)
+            assert (policy.resets, len(failures)) == (0, 2), "no flight has begun"
             remote.reset()
             remote._timeout_s = PATIENT_S  # type: ignore[attr-defined]
             for _ in range(2):

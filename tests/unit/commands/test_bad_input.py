@@ -59,7 +59,7 @@ BAD = [
     ("evalute", "did you mean evaluate?"),
     (f"--connect /dev/null,57600 {BLIND}", "no serial port"),
     (f"--connect /dev/none,57600 {BLIND}", "no such"),
-    ("--connect bluetooth --policy scripted --camera shm:unused", "HOST:PORT"),
+    (f"--connect bluetooth {BLIND} --record recorded --report a.mp4", "HOST:PORT"),
     *(
         (f"--connect nowhere {flag}", "--connect 'nowhere' is not understood")
         for flag in ("--dual-rate", "--no-dual-rate", "--single-rate")
