@@ -30,6 +30,7 @@ MAKE = {
 """Drawn for demonstrations, but not by ``random_conditions``."""
 NOMINAL_POSITION = (-0.661369108, -8.008113679, -3.14245931)
 NOMINAL_ATTITUDE = (0.995199671, 0.097863692, -0.00053679, -0.000157648)
+NOMINAL_FORCE_MPS2 = (-0.422129501, 0.070705367, -10.009848311)
 NOMINAL_VIEW = [
     [385.2, 398.4, 413.0, 428.3],
     [545.5, 506.4, 507.1, 533.1],
@@ -66,6 +67,7 @@ def test_the_nominal_flight_has_not_changed():
     truth = fly(NOMINAL).truth
     assert truth.position_ned_m == pytest.approx(NOMINAL_POSITION, abs=1e-7)
     assert truth.ned_from_body_wxyz == pytest.approx(NOMINAL_ATTITUDE, abs=1e-7)
+    assert truth.specific_force_body_mps2 == pytest.approx(NOMINAL_FORCE_MPS2, abs=1e-7)
 
 
 def test_the_nominal_view_has_not_changed():

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.course_flights import pwm_us
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course import AirborneStart
-from sitl.pilot.demonstrator import StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import STEP_NS, VehicleConfig
@@ -22,23 +20,18 @@ ALOFT = AirborneStart(
     ned_from_body_wxyz=IDENTITY,
     next_gate=0,
 )
-CENTRED = StickPositions(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 
 
-def hold(sticks, seconds=2.0, **conditions):
-    """Return the state after holding these sticks from a hover."""
+def lean_deg(seconds, **conditions):
+    """Return the lean after full right stick for a time, from a hover."""
     config = VehicleConfig(conditions=replace(NOMINAL, **conditions))
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
     vehicle.launch(ALOFT)
     for now_ns in range(STEP_NS, round(seconds * NS_PER_S), STEP_NS):
-        vehicle.ap.rc.override(pwm_us(sticks), now_ns)
+        vehicle.ap.rc.override([2000, 1500, 1500, 1500, *[65535] * 4], now_ns)
         vehicle.step(now_ns)
-    return vehicle.ap.truth
-
-
-def roll_deg(body):
-    return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
+    return math.degrees(to_euler(vehicle.ap.truth.ned_from_body_wxyz)[0])
 
 
 @pytest.mark.parametrize(
@@ -46,9 +39,8 @@ def roll_deg(body):
     [{"input_time_s": 0.3}, {"lean_rate_max_degps": 40.0}, {"lean_accel_max_cdegps2": 30_000.0}],
 )
 def test_a_softer_attitude_response_leans_later(slower):
-    right = CENTRED._replace(roll=1.0)
-    assert roll_deg(hold(right, 0.25, **slower)) < 0.8 * roll_deg(hold(right, 0.25))
-    assert roll_deg(hold(right, 2.0, **slower)) == pytest.approx(30.0, abs=1.5)
+    assert lean_deg(0.25, **slower) < 0.8 * lean_deg(0.25)
+    assert lean_deg(2.0, **slower) == pytest.approx(30.0, abs=1.5)
 
 
 def sent_ms(seed=0, seconds=1, interval_us=10_000, **conditions):
