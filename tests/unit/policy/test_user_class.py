@@ -1,7 +1,6 @@
-import re
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -219,23 +218,6 @@ class FailsTwice(FailsToClose):
         raise RuntimeError("no weights")
 
 
-class FailsInALibrary(Single):
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        return torch.nn.Linear(2, 2)(torch.zeros(3))
-
-
-class NoContract:
-    predict = Single.predict
-
-
-class NoPredict:
-    contract = Contract()
-
-
-class PredictIsNone(NoPredict):
-    predict = None
-
-
 class FastPair:
     __slots__ = ()  # no instance takes another attribute
     contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=1)
@@ -253,73 +235,6 @@ class RegisteredPair(FastPair):
 
     def __init_subclass__(cls, *, name):
         pass
-
-
-class NoFeatureDim(Single):
-    contract = Contract(arrays="numpy")
-    encode_visual = predict_fast = Single.predict
-
-
-class Swapped(Single):
-    def predict(self, state, image, action_history, num_diffusion_steps):
-        return np.zeros((1, 16, 4), np.float32)
-
-
-class SwappedFast(Single):
-    contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=13)
-
-    def encode_visual(self, image):
-        return np.zeros((1, 13), np.float32)
-
-    def predict_fast(self, state, feature, history, steps):
-        return np.zeros((1, 16, 4), np.float32)
-
-
-class Observing(Single):
-    def predict(self, observation, state, history, steps):
-        return np.full((1, 16, 4), 0.5, np.float32)
-
-
-class Keeping(Single):
-    def predict(self, frame, vehicle, past, steps, rgb=None, *, state=None):
-        return np.full((1, 16, 4), 0.5, np.float32)
-
-
-class ResetNeedsMore(Single):
-    def reset(self, seed):
-        pass
-
-
-class ResetFails(Single):
-    def reset(self):
-        raise RuntimeError("no memory to clear")
-
-
-class ContractFails(Single):
-    contract = property(lambda self: 1 / 0)
-
-
-class PredictFails(Single):
-    predict = property(lambda self: 1 / 0)
-
-
-class CloseIsMissing(Single):
-    close = property(lambda self: 1 / 0)
-
-
-class AsyncReset(Single):
-    async def reset(self):
-        self.chunks = 0
-
-
-class GeneratorClose(Single):
-    def close(self):
-        yield
-
-
-class NeedsMore:
-    def __init__(self, weights):
-        pass
 """
 
 
@@ -327,6 +242,22 @@ class NeedsMore:
 def mine(folder: Path) -> str:
     (folder / "mine.py").write_text(MINE)
     return "./mine.py"
+
+
+@pytest.fixture
+def odd(folder: Path) -> Callable[[str], str]:
+    """Write a class Odd behind those of ``MINE``; returns its ``--policy``."""
+
+    def write(text: str) -> str:
+        (folder / "mine.py").write_text(f"{MINE}\n\n{text}\n")
+        return "./mine.py:Odd"
+
+    return write
+
+
+def returning(chunk: str, arguments: str = "image, state, history, steps") -> str:
+    """Return the text of a class Odd that answers with a chunk."""
+    return f"class Odd(Single): predict = lambda self, {arguments}: {chunk}"
 
 
 def closed(name: str) -> int:
@@ -365,60 +296,90 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "message"),
+    ("text", "message"),
     [
-        ("NoContract", {}, "member contract must be.*it is None"),
-        ("NoPredict", {}, "no method predict"),
-        ("PredictIsNone", {}, "no method predict"),
-        ("NoFeatureDim", {}, "needs feature_dim"),
-        ("Swapped", {}, "predict is called with image, state, .* and has state, image, action_h"),
-        ("SwappedFast", {}, "predict_fast is called with feature, .* has state, feature, history"),
-        ("ResetNeedsMore", {}, "failed to reset: TypeError: .*missing 1 required .*'seed'"),
-        ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
-        ("ContractFails", {}, r"making it failed: ZeroDivisionError: .*\(.*mine\.py:\d+\)"),
-        ("PredictFails", {}, "making it failed: ZeroDivisionError"),
-        ("CloseIsMissing", {}, "failed to close: ZeroDivisionError"),
-        ("AsyncReset", {}, "reset is async or a generator: make it a plain method"),
-        ("GeneratorClose", {}, "close is async or a generator"),
-        ("FailsInALibrary", {}, r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)"),
-        ("NeedsMore", {}, r"cannot be made with Class\(\)"),
+        ("class Odd: predict = Single.predict", "member contract must be.*it is None"),
+        ("class Odd: contract = Contract()", "no method predict"),
+        ("class Odd(Single): predict = None", "no method predict"),
+        ("class Odd(Single): encode_visual = predict_fast = Single.predict", "needs feature_dim"),
+        (
+            "class Odd(Single): predict = lambda self, state, image, action_history, steps: 0",
+            "predict is called with image, state, .* and has state, image, action_h",
+        ),
+        (
+            "class Odd(FastPair): predict_fast = lambda self, state, feature, history, steps: 0",
+            "predict_fast is called with feature, .* has state, feature, history",
+        ),
+        (
+            "class Odd(Single): reset = lambda self, seed: 0",
+            "failed to reset: TypeError: .*missing 1 required .*'seed'",
+        ),
+        (
+            "class Odd(Single): reset = lambda self: [][0]",
+            r"failed to reset: IndexError: list index out of range \(.*mine.py:",
+        ),
+        (
+            "class Odd(Single): contract = property(lambda self: 1 / 0)",
+            r"making it failed: ZeroDivisionError: .*\(.*mine\.py:\d+\)",
+        ),
+        (
+            "class Odd(Single): predict = property(lambda self: 1 / 0)",
+            "making it failed: ZeroDivisionError",
+        ),
+        (
+            "class Odd(Single): close = property(lambda self: 1 / 0)",
+            "failed to close: ZeroDivisionError",
+        ),
+        (
+            "class Odd(Single):\n    async def reset(self): pass",
+            "reset is async or a generator: make it a plain method",
+        ),
+        ("class Odd(Single):\n    def close(self): yield", "close is async or a generator"),
+        ("class Odd:\n    def __init__(self, weights): pass", r"cannot be made with Class\(\)"),
+        (
+            returning("torch.nn.Linear(2, 2)(torch.zeros(3))"),
+            r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)",
+        ),
+        # Which numpy would convert in silence.
+        (
+            returning("np.zeros((1, 16, 4), int)"),
+            "an array of int64, and the contract's numbers are floats",
+        ),
+        (returning("np.zeros((1, 16, 4), bool)"), "an array of bool"),
+        (returning("np.zeros((1, 16, 4), complex)"), "an array of complex"),
+        (returning("np.zeros((1, 16, 4), str)"), "an array of <U"),
+        (returning("np.ma.masked_all((1, 16, 4), 'f4')"), "a masked array of float32"),
+    ],
+)
+def test_an_unusable_class_is_refused(odd, text, message):
+    with pytest.raises(PolicyError, match=message):
+        load(odd(text))
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
         ("Single", {"image_size": 64}, "takes 32x32"),
         ("TorchRemembers", {"engine": "openvino"}, r"takes a torch\.nn\.Module"),
         ("Other", {}, "'Single'"),
     ],
 )
-def test_an_unusable_class_is_refused(mine, name, changes, message):
+def test_flags_that_do_not_go_with_a_class_are_refused(mine, name, flags, message):
     with pytest.raises(PolicyError, match=message):
-        load(f"{mine}:{name}", **changes)
+        load(f"{mine}:{name}", **flags)
 
 
 @pytest.mark.parametrize(
-    ("chunk", "told"),
+    "arguments",
     [
-        ("chunk.astype(np.int64)", "an array of int64, and the contract's numbers are floats"),
-        ("chunk > 0", "an array of bool"),
-        ("chunk + 1j", "an array of complex"),
-        ("chunk.astype(str)", "an array of <U"),
-        ("np.ma.masked_array(chunk, chunk == 0)", "a masked array of float32"),
+        "observation, state, history, steps",
+        "frame, vehicle, past, steps, rgb=None, *, state=None",
     ],
 )
-def test_a_chunk_that_numpy_would_convert_in_silence_is_refused(mine, folder, chunk, told):
-    (folder / "mine.py").write_text(f"""{MINE}
-class Odd(Single):
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        chunk = np.zeros((1, 16, 4), np.float32)
-        return {chunk}
-""")
-    with pytest.raises(PolicyError, match=re.escape(told)):
-        load(f"{mine}:Odd")
-
-
-@pytest.mark.parametrize("name", ["Observing", "Keeping"])
-def test_only_inputs_that_are_passed_need_an_order_and_any_may_be_an_observation(
-    mine: str, name: str
-) -> None:
-    assert throttle(load(f"{mine}:{name}")) == 0.5
+def test_only_inputs_that_are_passed_need_an_order_and_any_may_be_an_observation(odd, arguments):
+    spec = odd(returning("np.full((1, 16, 4), 0.5, np.float32)", arguments))
+    assert throttle(load(spec)) == 0.5
 
 
 @pytest.mark.parametrize("name", ["FastPair", "RegisteredPair"])
