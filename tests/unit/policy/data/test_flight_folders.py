@@ -271,25 +271,39 @@ def test_flights_with_nothing_to_learn_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "column"),
+    ("column", "values"),
     [
-        *(("ticks", name) for name in ("attitude_ns", "velocity_ns", "feature_captured_ns")),
-        *(("ticks", name) for name in ("chunk_computed_ns", "predict_ns")),
-        ("frames", "gate_yaw_rad"),
+        *((name, ["x"] * 3) for name in ("attitude_ns", "velocity_ns", "feature_captured_ns")),
+        *((name, ["x"] * 3) for name in ("chunk_computed_ns", "predict_ns")),
+        *(("armed", [["yes"]] * 3), ("mode", [[1], [2, 3], []]), ("phase", [[1.0, 2.0]] * 3)),
+        *(("woke_ns", [0.0, math.nan, 2.0]), ("sent_ns", [1.0, 2.0, 1e30])),
+        ("gate_yaw_rad", ["x"] * 2),
     ],
 )
-def test_a_column_of_another_type_is_named_unless_it_is_empty(
-    tmp_path: Path, table: str, column: str
+def test_values_that_do_not_fit_a_column_are_named(
+    tmp_path: Path, column: str, values: list[Any]
 ) -> None:
-    path = flight(tmp_path / "a", solved_ns=[(5 * MS, MS)] * 3) / f"{table}.parquet"
-    rows = pq.read_table(path)
-    if column in rows.column_names:
-        rows = rows.drop_columns([column])
-    pq.write_table(rows.append_column(column, pa.array(["x"] * rows.num_rows)), path)
+    folder, table = flight(tmp_path / "a"), "frames" if column == "gate_yaw_rad" else "ticks"
+    retype(folder, column, values, table)
     with pytest.raises(DatasetError, match=f"{column} must hold "):
-        read_flight(path.parent)
-    pq.write_table(rows.append_column(column, pa.nulls(rows.num_rows)), path)
-    assert len(read_flight(path.parent).captured_ns) == 2
+        read_flight(folder)
+
+
+def test_empty_columns_and_those_in_another_encoding_are_read(tmp_path: Path) -> None:
+    folder = flight(tmp_path / "a", solved_ns=[(5 * MS, MS)] * 3)
+    retype(folder, "armed", [1, 0, 1])
+    retype(folder, "mode", pa.array(["ALT_HOLD"] * 3, pa.string_view()))
+    for name in ("attitude_ns", "velocity_ns", "feature_captured_ns", "predict_ns"):
+        retype(folder, name, pa.nulls(3))
+    retype(folder, "gate_yaw_rad", pa.nulls(2), "frames")
+    assert read_flight(folder).target_ns.tolist() == [0, 20 * MS]
+
+
+def retype(folder: Path, column: str, values: Any, table: str = "ticks") -> None:
+    path = folder / f"{table}.parquet"
+    rows = pq.read_table(path)
+    others = rows.drop_columns({column} & {*rows.column_names})
+    pq.write_table(others.append_column(column, [values]), path)
 
 
 def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
@@ -331,32 +345,3 @@ def test_flights_of_one_course_are_held_out_together(tmp_path: Path) -> None:
 def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
     write_meta(tmp_path / "flight", **meta)
     assert failure_of(tmp_path / "flight") == failure
-
-
-@pytest.mark.parametrize(
-    ("column", "values"),
-    [
-        *(("armed", [["yes"]] * 3), ("mode", [[1], [2, 3], []]), ("phase", [[1.0, 2.0]] * 3)),
-        *(("woke_ns", [0.0, math.nan, 2.0]), ("sent_ns", [1.0, 2.0, 1e30])),
-    ],
-)
-def test_values_that_do_not_fit_a_column_are_named(
-    tmp_path: Path, column: str, values: list[Any]
-) -> None:
-    folder = flight(tmp_path / "a")
-    retype(folder, column, values)
-    with pytest.raises(DatasetError, match=f"ticks: {column} must hold "):
-        read_flight(folder)
-
-
-def test_columns_in_another_encoding_are_read(tmp_path: Path) -> None:
-    folder = flight(tmp_path / "a")
-    retype(folder, "armed", [1, 0, 1])
-    retype(folder, "mode", pa.array(["ALT_HOLD"] * 3, pa.string_view()))
-    assert read_flight(folder).target_ns.tolist() == [0, 20 * MS]
-
-
-def retype(folder: Path, column: str, values: Any) -> None:
-    path = folder / "ticks.parquet"
-    table = pq.read_table(path)
-    pq.write_table(table.set_column(table.column_names.index(column), column, [values]), path)
