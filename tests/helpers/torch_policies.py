@@ -214,29 +214,14 @@ class Counter:
         self.calls += 1
 
 
-class Deciding(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = TwoRates.predict_fast(self, feature, state, history, steps)
-        return chunk if state[0, 2] < 100 else -chunk
+def changed(base: type[TwoRates], change: Callable[[Tensor, Tensor], Tensor]) -> TwoRates:
+    """Return a policy whose chunk is what ``change`` makes of that of ``base`` and of a state."""
 
+    class Changed(base):  # type: ignore[misc, valid-type]
+        def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Any:
+            return change(super().predict_fast(feature, state, history, steps), state)
 
-class DecidingByMin(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return chunk * min(state[0, 2], torch.tensor(100.0))
-
-
-class Reading(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1)
-
-
-class ReadingWritten(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        height = torch.zeros(2)
-        height.split(1)[0][0] = state[0, 2]
-        return super().predict_fast(feature, state, history, steps) * (100 - height[0].item())
+    return Changed()
 
 
 class ReadingConstants(TwoRates):
@@ -262,28 +247,6 @@ class Scripted(TwoRates):
     def __init__(self) -> None:
         super().__init__()
         self.visual_encoder = torch.jit.script(self.visual_encoder)
-
-
-class ScriptedDeciding(Scripted):
-    predict_fast = Deciding.predict_fast
-
-
-class ScriptedSelecting(Scripted):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return -chunk if len(state[state[:, 2] > 100]) else chunk
-
-
-class ScriptedSearching(Scripted):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return -chunk if len(torch.where(state > 100)[0]) else chunk
-
-
-class Drawing(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return chunk + 0.1 * torch.randn_like(chunk)
 
 
 class OnSchedule(TwoRates):
@@ -334,14 +297,6 @@ class Listening(TwoRates):
 class Resetting(TwoRates):
     def reset(self) -> None:
         """Called when a flight begins."""
-
-
-class Looping(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        for _ in range(100):
-            chunk = chunk + 1e-9
-        return chunk
 
 
 class Stepwise(TwoRates):

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from helpers import torch_policies
-from helpers.torch_policies import Counter, TwoRates
+from helpers.torch_policies import Counter, Scripted, TwoRates, changed
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
 from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
@@ -35,32 +35,47 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
+def read_where_written(chunk: Tensor, state: Tensor) -> Tensor:
+    height = torch.zeros(2)
+    height.split(1)[0][0] = state[0, 2]
+    return chunk * (100 - height[0].item())
+
+
+DECIDING = [
+    (TwoRates, lambda chunk, state: chunk if state[0, 2] < 100 else -chunk),
+    (TwoRates, lambda chunk, state: chunk * min(state[0, 2], torch.tensor(100.0))),
+    (TwoRates, lambda chunk, state: chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1)),
+    (TwoRates, read_where_written),
+    (Scripted, lambda chunk, state: chunk if state[0, 2] < 100 else -chunk),
+    (Scripted, lambda chunk, state: -chunk if len(state[state[:, 2] > 100]) else chunk),
+    (Scripted, lambda chunk, state: -chunk if len(torch.where(state > 100)[0]) else chunk),
+]
+NO_GRAPHS = [
+    *((partial(changed, *each), "it decides by the values of a tensor") for each in DECIDING),
+    (torch_policies.Counting, "it keeps calls from call to call"),
+    (torch_policies.CountingInClass, "it keeps calls from call to call"),
+    (torch_policies.CountingBelow, "it keeps calls, clock from call to call"),
+    (torch_policies.CountingInSlots, "it keeps calls, clock from call to call"),
+    (torch_policies.OnSchedule, "it calls now, which a graph cannot"),
+    (torch_policies.ReadingFile, "it calls .*open.*read"),
+    (torch_policies.ReadingQueue, "it calls empty, which a graph cannot"),
+    (torch_policies.Resetting, "the policy has reset"),
+    (
+        partial(changed, TwoRates, lambda chunk, _: chunk + 0.1 * torch.randn_like(chunk)),
+        "warning: engine torch: the same inputs do not give the same chunk again",
+    ),
+    (
+        partial(changed, TwoRates, lambda chunk, _: sum([1e-9] * 100, chunk)),
+        "its graph has 1.. operations, and at most 90",
+    ),
+]
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("Counting", "it keeps calls from call to call"),
-        ("CountingInClass", "it keeps calls from call to call"),
-        ("CountingBelow", "it keeps calls, clock from call to call"),
-        ("CountingInSlots", "it keeps calls, clock from call to call"),
-        ("Drawing", "warning: engine torch: the same inputs do not give the same chunk again"),
-        ("OnSchedule", "it calls now, which a graph cannot"),
-        ("ReadingFile", "it calls .*open.*read"),
-        ("ReadingQueue", "it calls empty, which a graph cannot"),
-        ("Resetting", "the policy has reset"),
-        ("Deciding", "it decides by the values of a tensor"),
-        ("DecidingByMin", "it decides by the values of a tensor"),
-        ("Reading", "it decides by the values of a tensor"),
-        ("ReadingWritten", "it decides by the values of a tensor"),
-        ("ScriptedDeciding", "it decides by the values of a tensor"),
-        ("ScriptedSelecting", "it decides by the values of a tensor"),
-        ("ScriptedSearching", "it decides by the values of a tensor"),
-        ("Looping", "its graph has 1.. operations, and at most 90"),
-    ],
-)
-def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason, monkeypatch):
+@pytest.mark.parametrize(("make", "reason"), NO_GRAPHS)
+def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(make, reason, monkeypatch):
     monkeypatch.setattr(openvino_modules, "MAX_OPERATIONS", 90)
-    policy, level = getattr(torch_policies, name)(), logging.root.level
+    policy, level = make(), logging.root.level
     runner, notes = choose_runner(policy, "auto", SETTINGS)
     assert runner.engine == "torch"
     assert logging.root.level == level  # the converter raises it
