@@ -5,7 +5,7 @@ be imported beside this project's torch (it needs torchvision, and torch < 2.12)
 """
 
 import json
-from collections.abc import Iterator
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -22,58 +22,45 @@ DEFAULT_FEATURES = {  # utils/constants.py:81-87
 }
 
 
-def broken_rules(root: Path) -> list[str]:
-    """Return all rules that a dataset breaks, in words."""
+def require_readable(root: Path) -> None:
+    """Fail if a dataset breaks a rule."""
     info = json.loads((root / "meta/info.json").read_text())
-    episodes = _concatenated(root / "meta/episodes")
-    rows = _concatenated(root / "data")
-    checks = (
-        _info(info),
-        _features(info, rows),
-        _rows(info, episodes, rows),
-        _tasks(root, info, rows),
-        _videos(root, info, episodes, rows),
-        _stats(root, info),
-        _policy_features(info),
-    )
-    return [broken for check in checks for broken in check]
+    assert info["codebase_version"] == "v3.0"  # datasets/utils.py:304
+    assert isinstance(info["fps"], int)  # datasets/utils.py:125, 156
+    assert info["fps"] > 0
+    assert info["splits"] == {"train": f"0:{info['total_episodes']}"}  # dataset_metadata.py:676
+    # utils/feature_utils.py:168-172: these names become inputs and outputs of a policy
+    taken = {name for name in info["features"] if name.startswith(("observation", "action"))}
+    assert taken == {"observation.images.front", "observation.state", "action"}
+    episodes, rows = (_joined(root / folder) for folder in ("meta/episodes", "data"))
+    _require_columns(info["features"], rows)
+    _require_places(info, episodes, rows)
+    _require_tasks(root, info, rows)
+    _require_videos(root, info, episodes.to_pylist(), rows)
+    _require_statistics(root, info["features"], episodes.to_pylist())
 
 
-def _concatenated(folder: Path) -> pa.Table:
+def _joined(folder: Path) -> pa.Table:
     """Join in the order of datasets/io_utils.py:75, which is that of the names."""
     return pa.concat_tables([pq.read_table(path) for path in sorted(folder.glob("*/*.parquet"))])
 
 
-def _info(info: dict[str, Any]) -> Iterator[str]:
-    if info["codebase_version"] != "v3.0":  # datasets/utils.py:304 check_version_compatibility
-        yield f"codebase_version {info['codebase_version']}"
-    if not isinstance(info["fps"], int) or info["fps"] <= 0:  # datasets/utils.py:125, 156
-        yield f"fps {info['fps']}"
-    if info["splits"] != {"train": f"0:{info['total_episodes']}"}:  # dataset_metadata.py:676
-        yield f"splits {info['splits']}"
-
-
-def _features(info: dict[str, Any], rows: pa.Table) -> Iterator[str]:
-    features = info["features"]
+def _require_columns(features: dict[str, Any], rows: pa.Table) -> None:
     for name, dtype in DEFAULT_FEATURES.items():
-        if features.get(name) != {"dtype": dtype, "shape": [1], "names": None}:
-            yield f"default feature {name}"
+        assert features[name] == {"dtype": dtype, "shape": [1], "names": None}, name
     stored = [name for name, feature in features.items() if feature["dtype"] != "video"]
-    if rows.column_names != stored:  # datasets/feature_utils.py:64: videos have no column
-        yield f"columns {rows.column_names}"
-    for name in set(stored) & set(rows.column_names):
+    assert rows.column_names == stored  # datasets/feature_utils.py:64: videos have no column
+    for name in stored:
         dtype = {"float32": pa.float32(), "int64": pa.int64()}[features[name]["dtype"]]
         width = features[name]["shape"][0]
         wanted = dtype if width == 1 else pa.list_(dtype, width)  # feature_utils.py:67-73
-        if not rows.schema.field(name).type.equals(wanted) or rows[name].null_count:
-            yield f"type of {name}: {rows.schema.field(name).type}"
+        assert (rows.schema.field(name).type, rows[name].null_count) == (wanted, 0), name
 
 
-def _rows(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[str]:
+def _require_places(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> None:
     lengths = episodes["length"].to_numpy()
     ends, frames = np.cumsum(lengths), np.concatenate([np.arange(count) for count in lengths])
-    if (info["total_frames"], info["total_episodes"]) != (rows.num_rows, len(lengths)):
-        yield "totals"
+    assert (info["total_frames"], info["total_episodes"]) == (rows.num_rows, len(lengths))
     wanted_rows = {
         "index": np.arange(rows.num_rows),  # dataset_reader.py:223: rows by absolute index
         "episode_index": np.repeat(np.arange(len(lengths)), lengths),
@@ -85,53 +72,40 @@ def _rows(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[
         "dataset_from_index": ends - lengths,
         "dataset_to_index": ends,
     }
-    for what, table, wanted in (
-        ("rows", rows, wanted_rows),
-        ("episodes", episodes, wanted_episodes),
-    ):
+    for table, wanted in ((rows, wanted_rows), (episodes, wanted_episodes)):
         for name, values in wanted.items():
-            if not np.array_equal(table[name].to_numpy(), values):
-                yield f"{name} of the {what}"
+            np.testing.assert_array_equal(table[name].to_numpy(), values, name)
 
 
-def _tasks(root: Path, info: dict[str, Any], rows: pa.Table) -> Iterator[str]:
+def _require_tasks(root: Path, info: dict[str, Any], rows: pa.Table) -> None:
     table = pq.read_table(root / "meta/tasks.parquet")
     pandas = json.loads((table.schema.metadata or {}).get(b"pandas", b"{}"))
     # io_utils.py:184, dataset_reader.py:352: the texts are pandas' index, selected by position
-    if pandas.get("index_columns") != ["task"] or not pa.types.is_string(table["task"].type):
-        yield "tasks are not the index"
-    if table["task_index"].to_pylist() != list(range(info["total_tasks"])):
-        yield "task_index is not the place of the task"
-    if not set(rows["task_index"].to_pylist()) <= set(table["task_index"].to_pylist()):
-        yield "a row of an unknown task"
+    assert pandas.get("index_columns") == ["task"]
+    assert pa.types.is_string(table["task"].type)
+    assert table["task_index"].to_pylist() == list(range(info["total_tasks"]))
+    assert set(rows["task_index"].to_pylist()) <= set(table["task_index"].to_pylist())
 
 
-def _videos(root: Path, info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[str]:
-    keys = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
-    used = {}
-    for key in keys:
-        for episode in episodes.to_pylist():
-            prefix = f"videos/{key}/"
+def _require_videos(
+    root: Path, info: dict[str, Any], episodes: list[dict[str, Any]], rows: pa.Table
+) -> None:
+    used: Counter[Path] = Counter()
+    for key in [name for name, each in info["features"].items() if each["dtype"] == "video"]:
+        for episode in episodes:
+            video = _below(f"videos/{key}/", episode)
             path = root / info["video_path"].format(  # dataset_metadata.py: get_video_file_path
-                video_key=key,
-                chunk_index=episode[f"{prefix}chunk_index"],
-                file_index=episode[f"{prefix}file_index"],
+                video_key=key, chunk_index=video["chunk_index"], file_index=video["file_index"]
             )
-            if not path.is_file():  # dataset_reader.py:185-200
-                yield f"{path.name} of episode {episode['episode_index']} is missing"
-                continue
-            pts_s, average_fps = _pts(path)
             part = rows.slice(episode["dataset_from_index"], episode["length"])
             # dataset_reader.py:278-279
-            asked = episode[f"{prefix}from_timestamp"] + part["timestamp"].to_numpy().astype(float)
-            used[path] = used.get(path, 0) + len(asked)
-            yield from _found(path, asked, pts_s, average_fps)
-            end = episode[f"{prefix}from_timestamp"] + episode["length"] / info["fps"]
-            if abs(episode[f"{prefix}to_timestamp"] - end) > TOLERANCE_S:
-                yield f"to_timestamp of episode {episode['episode_index']}"
+            asked_s = video["from_timestamp"] + part["timestamp"].to_numpy().astype(float)
+            used[path] += len(asked_s)
+            _require_found(path, asked_s)
+            end_s = video["from_timestamp"] + episode["length"] / info["fps"]
+            assert abs(video["to_timestamp"] - end_s) <= TOLERANCE_S
     for path, count in used.items():
-        if count != len(_pts(path)[0]):
-            yield f"{path.name} has {len(_pts(path)[0])} frames, {count} rows"
+        assert len(_pts(path)[0]) == count, path
 
 
 def _pts(path: Path) -> tuple[np.ndarray, float]:
@@ -141,43 +115,30 @@ def _pts(path: Path) -> tuple[np.ndarray, float]:
         return np.array(pts), float(stream.average_rate)
 
 
-def _found(path: Path, asked: np.ndarray, pts_s: np.ndarray, average_fps: float) -> Iterator[str]:
+def _require_found(path: Path, asked_s: np.ndarray) -> None:
     """Check that both decoders of lerobot find frame k where row k asks for it."""
-    wanted = asked.astype(np.float32)
-    nearest = np.abs(pts_s.astype(np.float32)[:, None] - wanted).min(axis=0)
-    if not (nearest < TOLERANCE_S).all():  # PyAV: video_utils.py:158-193
-        yield f"{path.name}: no frame within {TOLERANCE_S} s of {asked[nearest.argmax()]}"
-    place = np.array(
-        [round(at * average_fps) for at in asked]
-    )  # torchcodec: video_utils.py:387-404
-    if place.max() >= len(pts_s):
-        yield f"{path.name}: ends before row {int(place.argmax())}"
-    elif not (np.abs(pts_s[place].astype(np.float32) - wanted) < TOLERANCE_S).all():
-        yield f"{path.name}: another frame at its average rate {average_fps}"
+    pts_s, average_fps = _pts(path)
+    shown, wanted = pts_s.astype(np.float32), asked_s.astype(np.float32)
+    nearest = np.abs(shown[:, None] - wanted).min(axis=0)
+    assert nearest.max() < TOLERANCE_S, path  # PyAV: video_utils.py:158-193
+    places = [round(at * average_fps) for at in asked_s]  # torchcodec: video_utils.py:387-404
+    assert max(places) < len(shown), path
+    assert np.abs(shown[places] - wanted).max() < TOLERANCE_S, path
 
 
-def _stats(root: Path, info: dict[str, Any]) -> Iterator[str]:
+def _require_statistics(
+    root: Path, features: dict[str, Any], episodes: list[dict[str, Any]]
+) -> None:
     stats = json.loads((root / "meta/stats.json").read_text())
-    episodes = _concatenated(root / "meta/episodes").to_pylist()
-    for name, feature in info["features"].items():
-        for of in (stats.get(name, {}), *(_of_episode(e, name) for e in episodes)):
-            if not {"min", "max", "mean", "std", "count"} <= set(of):
-                yield f"stats of {name}: {sorted(of)}"
-                continue
-            # compute_stats.py:547-561
-            shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
+    for name, feature in features.items():
+        # compute_stats.py:547-561
+        shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
+        for of in (stats[name], *(_below(f"stats/{name}/", episode) for episode in episodes)):
+            assert {"min", "max", "mean", "std", "count"} <= set(of), name
             for kind, values in of.items():
-                if np.shape(values) != ((1,) if kind == "count" else shape):
-                    yield f"stats of {name}: {kind} has shape {np.shape(values)}"
+                assert np.shape(values) == ((1,) if kind == "count" else shape), (name, kind)
 
 
-def _of_episode(episode: dict[str, Any], name: str) -> dict[str, Any]:
-    prefix = f"stats/{name}/"
+def _below(prefix: str, episode: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns of an episode that begin with this, by the rest of their names."""
     return {k.removeprefix(prefix): v for k, v in episode.items() if k.startswith(prefix)}
-
-
-def _policy_features(info: dict[str, Any]) -> Iterator[str]:
-    """Check utils/feature_utils.py:168-172: these names become inputs and outputs of a policy."""
-    taken = {n for n in info["features"] if n.startswith(("observation", "action"))}
-    if taken != {"observation.images.front", "observation.state", "action"}:
-        yield f"a policy would take {sorted(taken)}"

@@ -22,10 +22,10 @@ from helpers.flight_folders import (
     write_meta,
     write_spot_flight,
 )
-from helpers.lerobot_rules import broken_rules
+from helpers.lerobot_rules import require_readable
 from helpers.status import status_of, told_by
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export import export, stretches, whole_or_nothing, write_dataset
+from mavbridge.commands.export import export, stretches, whole_or_nothing
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data import lerobot_format as names
@@ -80,13 +80,11 @@ def fly(
     )
 
 
-def write(flights: list[Path], out: Path) -> str:
-    out.mkdir()
-    return write_dataset(
-        [read_flight(flight) for flight in flights],
-        out,
-        ExportConfig(out=out, task="fly the gates"),
-    )
+def exported(flights: list[Path], out: Path, **options: object) -> Path:
+    config = ExportConfig(out=out, task="race")
+    assert export(flights, replace(config, **options)) == 0  # type: ignore[arg-type]
+    require_readable(out)
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -98,16 +96,14 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture(scope="module")
 def dataset(flights: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three episodes."""
-    out = tmp_path_factory.mktemp("exported") / "dataset"
-    write(flights, out)
-    return out
+    return exported(flights, tmp_path_factory.mktemp("exported") / "dataset")
 
 
-def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
-    assert broken_rules(dataset) == []
+def test_the_files_are_where_the_reader_looks(dataset: Path) -> None:
     files = [str(path.relative_to(dataset)) for path in dataset.rglob("*") if path.is_file()]
     assert sorted(files) == [
         *(f"data/chunk-000/file-00{k}.parquet" for k in range(3)),
+        "mavbridge.toml",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
         "meta/stats.json",
@@ -143,16 +139,13 @@ def test_files_are_grouped_in_chunks(
     flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mavbridge.commands.export_dataset.FILES_A_CHUNK", 2)
-    write(flights, tmp_path / "out")
-    assert broken_rules(tmp_path / "out") == []
-    assert [len(list(each.decode())) for each in read_dataset(tmp_path / "out")] == [20, 25, 30]
+    out = exported(flights, tmp_path / "out")
+    assert [len(list(each.decode())) for each in read_dataset(out)] == [20, 25, 30]
 
 
 def test_a_pause_makes_two_episodes(tmp_path: Path) -> None:
     flight = fly(tmp_path / "a", expert=False, released=range(40, 60), source="flight")
-    write([flight], tmp_path / "out")
-    assert broken_rules(tmp_path / "out") == []
-    first, second = read_dataset(tmp_path / "out")
+    first, second = read_dataset(exported([flight], tmp_path / "out"))
     np.testing.assert_array_equal(first.target, first.sent)  # there is no expert
     assert (first.target_ns <= first.captured_ns).all()
     released = (START + 400 * MS, START + 600 * MS)
@@ -173,9 +166,8 @@ def test_actions_that_the_link_refused_cut_no_episode(tmp_path: Path) -> None:
 
 def test_a_video_that_breaks_off_ends_its_episode(tmp_path: Path) -> None:
     flights = [fly(tmp_path / "a", video_frames=12), fly(tmp_path / "b", number=1)]
-    write(flights, tmp_path / "out")
-    assert broken_rules(tmp_path / "out") == []
-    assert [len(episode.captured_ns) for episode in read_dataset(tmp_path / "out")] == [12, 30]
+    out = exported(flights, tmp_path / "out")
+    assert [len(episode.captured_ns) for episode in read_dataset(out)] == [12, 30]
 
 
 def test_statistics_are_those_of_the_data(dataset: Path) -> None:
@@ -201,7 +193,7 @@ def test_the_command_exports_what_train_can_read(tmp_path: Path) -> None:
     out = tmp_path / "data[set]"
     status, text = told_by("export", tmp_path / "flights", "--out", out, "--task", "race")
     assert (status, "1 of 3 flights" in text, f"{out}: 2 episodes" in text) == (0, True, True)
-    assert broken_rules(out) == []
+    require_readable(out)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data[set]", "flights"]
     assert [len(episode.captured_ns) for episode in read_dataset(out)] == [30, 30]
     small = ("--policy", "toge:small:resnet8", "--image-size", "32", "--steps", "1")
@@ -300,13 +292,6 @@ def flight(folder: Path, contract: Contract = USUAL, size: int = 64) -> Path:
     write_spot_flight(folder, 1, seconds=1.0, size=size)
     write_meta(folder, contract=asdict(contract))
     return folder
-
-
-def exported(flights: list[Path], out: Path, **options: object) -> Path:
-    config = ExportConfig(out=out, task="race")
-    assert export(flights, replace(config, **options)) == 0  # type: ignore[arg-type]
-    assert broken_rules(out) == []
-    return out
 
 
 def test_images_are_resized_as_a_policy_gets_them(tmp_path: Path) -> None:
