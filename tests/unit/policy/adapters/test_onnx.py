@@ -8,6 +8,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +92,7 @@ class Drawing(nn.Module):
 
 def test_a_graph_that_draws_random_numbers_is_warned_of(tmp_path: Path) -> None:
     write(Drawing(), tmp_path / "mine.onnx", {"image": IMAGE, "state": STATE})
-    (tmp_path / "mavbridge.toml").write_text(
-        "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
-    )
+    graphs.write_contract(tmp_path, horizon=8)
     loaded = load(f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
     (warning,) = [note for note in loaded.notes if isinstance(note, Warned)]
     assert warning.text.startswith("engine openvino-f32: the same inputs do not give")
@@ -290,18 +289,18 @@ def test_a_graph_without_an_axis_for_the_batch_is_given_none(tmp_path: Path) -> 
     assert sticks[0, 0] == pytest.approx(np.array([1, math.e, 1, 1]) / (3 + math.e), abs=1e-3)
 
 
-@pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
-def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
+@pytest.mark.parametrize(
+    ("hidden", "shape"),
+    [
+        *((("h_in", "h_out"), shape) for shape in ((1, 1, 3), ())),
+        *((hidden, (1, 1, 3)) for hidden in (("state_in_0", "state_out_0"), ("h", "hn"))),
+    ],
+)
+def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden, shape):
     graphs.write_contract(tmp_path)
-    graphs.recurrent(tmp_path / "policy.onnx", hidden=hidden)
+    graphs.recurrent(tmp_path / "policy.onnx", hidden=hidden, shape=shape)
     if hidden == ("h", "hn"):
         graphs.describe(tmp_path, hidden={"h": "hn"}, outputs={"chunk": "actions"})
-    require_counting(fly(f"onnx:{tmp_path}"))
-
-
-def test_a_hidden_state_may_be_one_number(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.recurrent(tmp_path / "policy.onnx", shape=())
     require_counting(fly(f"onnx:{tmp_path}"))
 
 
@@ -325,62 +324,56 @@ def test_an_observation_of_four_axes_is_an_image(
     assert act(fly(f"onnx:{tmp_path}"), level=255)[0] == pytest.approx([1.0] * 4, rel=5e-3)
 
 
-def external(folder: Path, change: Callable[[Path], object]) -> None:
-    graphs.actor(folder / "policy.onnx", external=True)
-    change(folder / "policy.onnx.data")
+def external(path: Path, change: Callable[[Path], object]) -> None:
+    graphs.actor(path, external=True)
+    change(path.with_name("policy.onnx.data"))
 
 
 def pointer(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 208\n")
 
 
-def external_without_length(folder: Path, change: Callable[[Path], object]) -> None:
+def external_without_length(path: Path) -> None:
     """As ``external``; the entry "length" of the weights, which is optional, is left out."""
-    external(folder, change)
-    model = onnx.load(folder / "policy.onnx", load_external_data=False)
+    external(path, Path.unlink)
+    model = onnx.load(path, load_external_data=False)
     for each in model.graph.initializer:
         kept = [entry for entry in each.external_data if entry.key == "location"]
         del each.external_data[:]
         each.external_data.extend(kept)
-    (folder / "policy.onnx").write_bytes(model.SerializeToString())
+    path.write_bytes(model.SerializeToString())
 
 
-def nonzero(folder: Path) -> None:
+def one_node(path: Path, kind: str, *, weight: np.ndarray | None = None, domain: str = "") -> None:
+    """Write obs [1, 13] -> one node -> actions."""
+    weights = {} if weight is None else {"w": weight}
+    nodes = [helper.make_node(kind, ["obs", *weights], ["actions"], domain=domain)]
+    outputs = {"actions": (graphs.FLOAT, (1, 4 if weight is None else weight.shape[1]))}
+    graphs.save_graph(path, nodes, {"obs": (graphs.FLOAT, STATE)}, outputs, weights)
+
+
+def nonzero(path: Path) -> None:
     """Write obs [1, 13] -> the indices of its numbers other than 0, as many as there are."""
     nodes = [
         helper.make_node("NonZero", ["obs"], ["indices"]),
         helper.make_node("Cast", ["indices"], ["actions"], to=graphs.FLOAT),
     ]
     inputs, outputs = {"obs": (graphs.FLOAT, STATE)}, {"actions": (graphs.FLOAT, ("n", "m"))}
-    graphs.save_graph(folder / "policy.onnx", nodes, inputs, outputs, {})
+    graphs.save_graph(path, nodes, inputs, outputs, {})
 
 
-def one_node(
-    folder: Path, kind: str, *, weight: np.ndarray | None = None, domain: str = ""
-) -> None:
-    """Write obs [1, 13] -> one node -> actions."""
-    weights = {} if weight is None else {"w": weight}
-    graphs.save_graph(
-        folder / "policy.onnx",
-        [helper.make_node(kind, ["obs", *weights], ["actions"], domain=domain)],
-        {"obs": (graphs.FLOAT, (1, 13))},
-        {"actions": (graphs.FLOAT, (1, 4 if weight is None else weight.shape[1]))},
-        weights,
-    )
-
-
-def recurrent_encoder(folder: Path) -> None:
+def recurrent_encoder(path: Path) -> None:
     port = (graphs.FLOAT, IMAGE)
     nodes = [
         helper.make_node("Add", ["image", "h_in"], ["h_out"]),
         helper.make_node("Neg", ["h_out"], ["feature"]),
     ]
-    path, outputs = folder / "encoder.onnx", {"feature": port, "h_out": port}
-    graphs.save_graph(path, nodes, {"image": port, "h_in": port}, outputs, {})
-    (folder / "head.onnx").touch()
+    inputs, outputs = {"image": port, "h_in": port}, {"feature": port, "h_out": port}
+    graphs.save_graph(path.with_name("encoder.onnx"), nodes, inputs, outputs, {})
+    path.with_name("head.onnx").touch()
 
 
-def growing(folder: Path) -> None:
+def growing(path: Path) -> None:
     """Cache of all states so far, as transformers export it."""
     nodes = [
         helper.make_node("Unsqueeze", ["obs", "axis"], ["new"]),
@@ -393,8 +386,18 @@ def growing(folder: Path) -> None:
         "kv_out": (graphs.FLOAT, (1, "all", 13)),
     }
     weights = {"axis": np.array([1]), "w": np.eye(13, 4, dtype=np.float32)}
-    inputs = {"obs": (graphs.FLOAT, (1, 13)), "kv_in": (graphs.FLOAT, (1, "past", 13))}
-    graphs.save_graph(folder / "policy.onnx", nodes, inputs, outputs, weights)
+    inputs = {"obs": (graphs.FLOAT, STATE), "kv_in": (graphs.FLOAT, (1, "past", 13))}
+    graphs.save_graph(path, nodes, inputs, outputs, weights)
+
+
+def described(path: Path, write: Write = graphs.actor, **tables: Any) -> None:
+    write(path)
+    graphs.describe(path.parent, **tables)
+
+
+def cut_short(path: Path) -> None:
+    graphs.actor(path)
+    os.truncate(path, 150)
 
 
 class Deep(nn.Module):
@@ -406,43 +409,40 @@ class Deep(nn.Module):
 
 REFUSED: dict[str, tuple[Write, str]] = {
     "external data missing": (
-        lambda folder: external(folder, Path.unlink),
+        partial(external, change=Path.unlink),
         r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
     "external data a pointer": (
-        lambda folder: external(folder, pointer),
+        partial(external, change=pointer),
         r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
     ),
     "external data of no length missing": (
-        lambda folder: external_without_length(folder, Path.unlink),
+        external_without_length,
         r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
     "output of no one size": (nonzero, r"has the shape \[2,\.\.13\], which depends on the values"),
     "integer actions": (
-        lambda folder: graphs.actor(folder / "policy.onnx", action_type=TensorProto.INT64),
+        partial(graphs.actor, action_type=TensorProto.INT64),
         r"chunk is of type i64",
     ),
     "integer image": (
-        lambda folder: graphs.image_actor(folder / "policy.onnx", kind=TensorProto.INT32),
+        partial(graphs.image_actor, kind=TensorProto.INT32),
         r"\['image'\] is of type i32",
     ),
     "state of another width": (
-        lambda folder: graphs.actor(folder / "policy.onnx", state_dim=17),
+        partial(graphs.actor, state_dim=17),
         r"its state is \[1,17\], and by the contract \[1, 13\]: set .*\[state\] names",
     ),
     "image of another size": (
-        lambda folder: graphs.image_actor(folder / "policy.onnx", shape=(1, 3, 64, 64)),
+        partial(graphs.image_actor, shape=(1, 3, 64, 64)),
         r"its image is \[1,3,64,64\], and by the contract \[1, 3, 32, 32\]: set image_height",
     ),
     "channels last": (
-        lambda folder: graphs.image_actor(folder / "policy.onnx", shape=(1, 32, 32, 3)),
+        partial(graphs.image_actor, shape=(1, 32, 32, 3)),
         r"its image is \[1,32,32,3\].*export it .*channels first",
     ),
     "hidden of another shape": (
-        lambda folder: [
-            graphs.recurrent(folder / "policy.onnx"),
-            graphs.describe(folder, hidden={"h_in": "actions"}),
-        ],
+        partial(described, write=graphs.recurrent, hidden={"h_in": "actions"}),
         r"h_in is \[1, 1, 3\] and its output actions \[1, 4\]",
     ),
     "hidden that grows": (
@@ -454,43 +454,32 @@ REFUSED: dict[str, tuple[Write, str]] = {
         r"encoder\.onnx: an encoder cannot have a hidden state, got \['h_in'\]",
     ),
     "no such output": (
-        lambda folder: [
-            graphs.actor(folder / "policy.onnx"),
-            graphs.describe(folder, outputs={"chunk": "action"}),
-        ],
+        partial(described, outputs={"chunk": "action"}),
         r"no output 'action' \(actions\)",
     ),
-    "graph cut": (
-        lambda folder: [
-            graphs.actor(folder / "policy.onnx"),
-            os.truncate(folder / "policy.onnx", 150),
-        ],
-        r"policy\.onnx cannot be read as ONNX .*copy it again",
-    ),
+    "graph cut": (cut_short, r"policy\.onnx cannot be read as ONNX .*copy it again"),
     "operator of a vendor": (
-        lambda folder: one_node(folder, "Foo", domain="com.acme"),
+        partial(one_node, kind="Foo", domain="com.acme"),
         r"policy\.onnx holds what OpenVINO cannot run \(.*com\.acme\.Foo.*ONNX standard",
     ),
     "three actions": (
-        lambda folder: one_node(folder, "MatMul", weight=np.zeros((13, 3), np.float32)),
+        partial(one_node, kind="MatMul", weight=np.zeros((13, 3), np.float32)),
         r"onnx:.*its chunk is \[1, 3\], and its last axis must be the 4 numbers",
     ),
     "not a number": (
-        lambda folder: one_node(folder, "MatMul", weight=np.full((13, 4), np.nan, np.float32)),
+        partial(one_node, kind="MatMul", weight=np.full((13, 4), np.nan, np.float32)),
         r"onnx:.*NaN or infinity",
     ),
     "unknown input": (
-        lambda folder: write(
-            ForwardOnly(), folder / "policy.onnx", {"image": IMAGE, "thing": STATE}
-        ),
+        lambda path: write(ForwardOnly(), path, {"image": IMAGE, "thing": STATE}),
         r"input \['thing'\] is unknown.*'state': \[.*'proprio'",
     ),
     "script of several outputs": (
-        lambda folder: graphs.save_script(folder / "policy.pt", graphs.TupleActor()),
+        lambda path: graphs.save_script(path.with_suffix(".pt"), graphs.TupleActor()),
         r"returns 3 values \(0, 1, 2\).*\"chunk\": 0",
     ),
     "script that fails inside of torch": (
-        lambda folder: graphs.save_script(folder / "policy.pt", Deep()),
+        lambda path: graphs.save_script(path.with_suffix(".pt"), Deep()),
         r"policy\.pt failed on a state: .*13 and 7x4",
     ),
 }
@@ -500,7 +489,7 @@ REFUSED: dict[str, tuple[Write, str]] = {
 def test_unusable_graphs_are_refused_in_one_sentence_by_cause(tmp_path: Path, case: str) -> None:
     write, told = REFUSED[case]
     graphs.write_contract(tmp_path)
-    write(tmp_path)
+    write(tmp_path / "policy.onnx")
     script = tmp_path / "policy.pt"
     with pytest.raises(PolicyError, match=told) as refusal:
         fly(f"torchscript:{script}" if script.exists() else f"onnx:{tmp_path}")
