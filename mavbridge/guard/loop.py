@@ -46,8 +46,7 @@ WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
 their signatures must be less than a minute old, and the choice of the safe mode may change. In
 thrust modes they repeat the last throttle, which should be recent."""
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
-_ENGAGED = (*_HELD, Phase.RELEASING)
-_TAKEN = (*_ENGAGED, Phase.PREPARING)
+_TAKEN = (*_HELD, Phase.RELEASING, Phase.PREPARING)
 _MOTION = ("telemetry", "status", "position_ned_m")
 _LINK, _STATUS = (
     attrgetter(*(each.name for each in fields(kind) if each.name not in _MOTION))
@@ -378,7 +377,7 @@ class GuardLoop:
     def _change_phase(self, phase: Phase, reason: Reason | None) -> None:
         """Announce on the link who has control."""
         before, self._phase = self._phase, phase
-        self._link.is_engaged = self._phase in _ENGAGED
+        self._link.is_engaged = self._phase in _TAKEN
         text: str | None = None
         match self._phase:
             case Phase.FLYING:

@@ -91,7 +91,8 @@ class MavlinkLink:
         self.commands = VehicleCommands(self._command, self._report, clock)
         self._sender = ActionSender(self._connection, self._codec, clock)
         self.is_engaged = False
-        """True while we hold or release the vehicle's sticks: no other address is followed."""
+        """True from the way in to the end of the release: only the vehicle's own clock shows that
+        it has another address."""
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self.vehicle: VehicleSession | None = None
         """Present session, for reading; None before the vehicle is found."""

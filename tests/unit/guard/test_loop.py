@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from helpers.fakes import START_NS, FakeClock, FakeLink
-from helpers.guard_facts import flight_settings, make_chunk
+from helpers.guard_facts import engagement_settings, flight_settings, make_chunk
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
@@ -274,6 +274,15 @@ def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
         "mavbridge: control given back: the policy has failed; then mode changed from BRAKE to "
         "LOITER",
     ]
+
+
+def test_a_vehicle_that_moves_on_the_way_in_is_followed_as_in_flight() -> None:
+    """A new session would give its sticks back, in the middle of a takeoff."""
+    arms = flight_settings(engagement=engagement_settings(modes=("ALT_HOLD",), arm=True))
+    rig = Rig(first=[arms])
+    rig.solves = False
+    assert rig.run(0.1).ticks[-1].phase is Phase.PREPARING
+    assert rig.link.is_engaged
 
 
 def test_work_that_begins_before_the_slot_sends_at_the_slot() -> None:
