@@ -246,9 +246,9 @@ def rate(successes: int, count: int) -> Estimate:
     centre = (share + z2 / (2 * count)) / (1 + z2 / count)
     spread = math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
     half = Z95 * spread / (1 + z2 / count)
-    return Estimate(
-        value=share, low=max(0.0, centre - half), high=min(1.0, centre + half), count=count
-    )
+    # Rounding may leave the share itself out: a rate of 0 had a lower limit of 6e-17.
+    low, high = min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share)
+    return Estimate(value=share, low=low, high=high, count=count)
 
 
 def mean(values: Sequence[float]) -> Estimate | None:

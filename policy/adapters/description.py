@@ -179,7 +179,7 @@ def find_onnx_files(spec: str, path: Path, contract_file: Path | None) -> OnnxFi
 
 def _graphs(spec: str, path: Path) -> tuple[Path | None, Path]:
     if path.is_file():
-        if path.suffix != ".onnx":
+        if path.suffix.lower() != ".onnx":
             raise CheckpointError(f"--policy {spec}: not a .onnx file; give {KINDS}")
         return None, path
     encoder, denoiser, head, whole = (path / name for name in (ENCODER, DENOISER, HEAD, WHOLE))

@@ -219,7 +219,7 @@ def onnx_files(source: Path) -> list[Path]:
     """Return the graphs of a file or folder; empty if it is neither."""
     if source.is_dir():
         return sorted(source.glob("*.onnx"))
-    return [source] if source.suffix == ".onnx" and source.is_file() else []
+    return [source] if source.suffix.lower() == ".onnx" and source.is_file() else []
 
 
 def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:

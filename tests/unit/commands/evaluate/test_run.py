@@ -173,6 +173,7 @@ def test_intervals_are_those_of_the_textbook(
     estimate = rate(successes, count)
     assert estimate.value == successes / count
     assert (estimate.low, estimate.high) == pytest.approx((low, high), abs=1e-4)
+    assert estimate.low <= estimate.value <= estimate.high
 
 
 def test_the_interval_of_a_mean_is_that_of_its_standard_error() -> None:

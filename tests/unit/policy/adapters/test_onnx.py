@@ -76,12 +76,12 @@ IMAGE, STATE = (1, 3, 32, 32), (1, 13)
 
 def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
     shapes = {"observation.images.front": IMAGE, "observation.state": STATE}
-    write(ForwardOnly(), tmp_path / "mine.onnx", shapes)
+    write(ForwardOnly(), tmp_path / "mine.ONNX", shapes)
     (tmp_path / "mavbridge.toml").write_text(
         "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
     )
-    loaded = load(f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
-    assert "mine.onnx" in "".join(loaded.notes)
+    loaded = load(f"onnx:{tmp_path / 'mine.ONNX'}", dual_rate=False)
+    assert "mine.ONNX" in "".join(loaded.notes)
     require_same(loaded.runner, load("helpers.torch_policies:ForwardOnly", dual_rate=False).runner)
 
 
