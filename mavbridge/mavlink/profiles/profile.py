@@ -69,9 +69,10 @@ def condition_streams(estimator: str) -> tuple[StreamGroup, ...]:
     """Return the streams of health, landing and estimator, which a flight can do without."""
     health = "a low battery and a receiver that fails are not seen"
     position = "the loss of its position estimate is not seen"
+    air = "neither a landing nor a frozen image ends the flight"
     return (
         StreamGroup(("SYS_STATUS",), 2.0, without=health),
-        StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without="a landing does not end the flight"),
+        StreamGroup(("EXTENDED_SYS_STATE",), 5.0, without=air),
         StreamGroup((estimator,), 5.0, without=position),
     )
 

@@ -241,6 +241,7 @@ def test_what_stays_away_is_told_once_and_stood_in_for_while_it_does() -> None:
         "CURRENT_MODE",
         "EXTENDED_SYS_STATE",
     ]
+    assert link.texts[1].endswith(": neither a landing nor a frozen image ends the flight")
     assert link.stand_ins == pytest.approx(8.0 * 20, rel=0.05)
     link.silent, before = set(), link.stand_ins
     link.run(1.0)
