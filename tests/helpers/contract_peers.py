@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import pytest
 from pymavlink import mavutil
@@ -28,22 +28,6 @@ ALOFT = AirborneStart(
 )
 
 
-class Peer(Protocol):
-    """A flight controller at the other end of a byte link."""
-
-    def now_ns(self) -> int: ...
-
-    def send(self, data: bytes) -> None: ...
-
-    def advance(self, duration_ns: int) -> bytes:
-        """Let time pass; return the bytes received meanwhile."""
-        ...
-
-    def put_in_air(self) -> None:
-        """Spare a simulated vehicle its takeoff."""
-        ...
-
-
 class MockPeer:
     """The vehicle of ``sitl`` in this process. Only ``advance`` moves its time."""
 
@@ -58,6 +42,7 @@ class MockPeer:
         self.vehicle.receive(0, data, self._now_ns)
 
     def advance(self, duration_ns: int) -> bytes:
+        """Let time pass; return the bytes received meanwhile."""
         end_ns = self._now_ns + duration_ns
         taken = b""
         while self._now_ns < end_ns:
@@ -67,6 +52,7 @@ class MockPeer:
         return taken
 
     def put_in_air(self) -> None:
+        """Spare a simulated vehicle its takeoff."""
         self.vehicle.launch(ALOFT)
 
 
@@ -103,6 +89,10 @@ class ExternalPeer:
 
     def close(self) -> None:
         self._link.close()
+
+
+Peer = MockPeer | ExternalPeer
+"""A flight controller at the other end of a byte link."""
 
 
 class Companion:

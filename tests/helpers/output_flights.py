@@ -79,9 +79,6 @@ class Aftermath:
 
     neutral_ms: float | None
     """Time until a command was level or at rest, another mode took over, or it was disarmed."""
-    mode_ms: float | None
-    mode: str | None
-    """First mode that differs from that of the flight."""
     lean_held_ms: float
     """Time for which it kept nine tenths of its initial lean."""
     flew_again: bool
@@ -283,11 +280,8 @@ class OutputFlight(GuardFlight):
             if (s.t_s - since_s) * 1e3 > neutral_ms
         )
         lean_ms = first_ms(lambda s: s.lean_deg < 0.9 * before.lean_deg)
-        other = next((s.mode for s in after if s.mode != self.mode), None)
         return Aftermath(
             neutral_ms=neutral_ms,
-            mode_ms=first_ms(lambda s: s.mode != self.mode),
-            mode=other,
             lean_held_ms=(after[-1].t_s - since_s) * 1e3 if lean_ms is None else lean_ms,
             flew_again=flew_again,
             final_mode=after[-1].mode,

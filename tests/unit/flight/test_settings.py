@@ -48,21 +48,6 @@ def test_the_process_is_told_what_the_flags_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dual_rate", "chunk_period_ns"), [(True, 20_000_000), (False, 50_000_000)]
-)
-def test_periods_follow_the_rates(dual_rate: bool, chunk_period_ns: int) -> None:
-    rates = Rates(stick_rate=400.0, action_rate=50.0, rate=20.0)
-    settings = settings_for(FlyConfig(link=LINK, rates=rates), dual_rate=dual_rate)
-    assert settings.stick_period_ns == 2_500_000
-    assert settings.chunk_period_ns == chunk_period_ns
-
-
-def test_smoothing_is_that_of_the_flags() -> None:
-    smoothing = settings_for(FlyConfig(link=LINK, limits=Limits(tau=0.1, max_slew=3.0))).smoothing
-    assert (smoothing.tau_s, smoothing.limits.change_per_s) == (0.1, (3.0,) * 4)
-
-
-@pytest.mark.parametrize(
     ("contract_deg", "flag_deg", "limit_deg"),
     [
         (None, None, 60.0),  # the default
@@ -83,9 +68,11 @@ def test_the_envelope_is_widened_by_the_contract_and_set_by_the_flag(
     assert (envelope.height_m, envelope.speed_mps, envelope.distance_m) == (120.0, 20.0, 300.0)
 
 
-def test_engaging_and_leaving_follow_the_flags() -> None:
+def test_rates_smoothing_and_the_ways_in_and_out_follow_the_flags() -> None:
     config = FlyConfig(
         link=replace(LINK, output="manual-control"),
+        rates=Rates(stick_rate=400.0, action_rate=50.0, rate=20.0),
+        limits=Limits(tau=0.1, max_slew=3.0),
         arm=True,
         mode="altctl",
         engage_channel=8,
@@ -94,7 +81,11 @@ def test_engaging_and_leaving_follow_the_flags() -> None:
         then="hold",
         duration=1.5,
     )
-    assert settings_for(config).engagement == EngagementSettings(
+    settings = settings_for(config)
+    assert (settings.stick_period_ns, settings.chunk_period_ns) == (2_500_000, 20_000_000)
+    assert settings_for(config, dual_rate=False).chunk_period_ns == 50_000_000
+    assert (settings.smoothing.tau_s, settings.smoothing.limits.change_per_s) == (0.1, (3.0,) * 4)
+    assert settings.engagement == EngagementSettings(
         modes=("ALT_HOLD", "ALTCTL"),
         mode="ALTCTL",
         arm=True,
