@@ -42,12 +42,6 @@ def test_a_number_out_of_range_is_refused_by_its_name(config: type[Ranged], fiel
             config(**needed | {field: value})
 
 
-def test_settings_have_the_names_of_the_file() -> None:
-    names = {name for name, _ in RANGES.values()}
-    for name in ("limits.stall", "envelope.tilt", "setpoints.yaw_rate", "link.timeout", "gusts"):
-        assert name in names
-
-
 @pytest.mark.parametrize(
     ("changes", "is_dual", "steps"),
     [

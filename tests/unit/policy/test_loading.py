@@ -81,13 +81,8 @@ def test_a_checkpoint_decides_what_is_built(checkpoint: Path, small_toge: Toge) 
     ("spec", "changes", "message"),
     [
         ("vla", {}, "package.module:Class"),
-        ("scripted:loop", {}, "square"),
-        ("scripted:square:position", {}, "velocity"),
         ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
-        ("toge:huge", {"allow_untrained": True}, "neither a size"),
-        ("toge:medium", {}, "network.allow_untrained"),
         ("resnet-unet:resnet50", {"allow_untrained": True}, "does not take 'resnet50'"),
-        ("toge", {"checkpoint": Path("absent.safetensors")}, "no such file"),
         ("toge", {"checkpoint": Path("weights.bin")}, "not a checkpoint"),
         ("toge", {"image_size": 64}, "network.image_size=64 contradicts"),
         ("toge:resnet18", {"allow_untrained": True, "image_size": 1}, "image_height"),

@@ -51,16 +51,6 @@ def read_back(folder: Path) -> tuple[list[int], list[int]]:
     return [number_of(rgb) for rgb in read_video(folder / "camera.mp4")], rows
 
 
-def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> None:
-    with writer(tmp_path, "offline") as video:
-        for k in range(200):  # the ring is far smaller
-            video.submit(picture(k), make_row(k))
-        video.finish()
-    assert read_back(tmp_path) == (list(range(200)), list(range(200)))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["camera.mp4", "frames.parquet"]
-    assert video.written == 200
-
-
 def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
     job = VideoJob(tmp_path / "odd.mp4", hz=10)
     with closing(VideoWriter(job, pressure="offline")) as video:
