@@ -1,11 +1,14 @@
 """The smallest world model, hooks of a training run on a made-up clock, and written weights."""
 
+import json
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from safetensors import safe_open
 
+from policy.checkpoints.networks import TRAINING_KEY
 from policy.contract import Contract
 from policy.nets.world_model.config import WorldModelConfig
 from policy.training.report import Hooks, TrainingProgress
@@ -28,6 +31,13 @@ def make_hooks(
     """Make hooks with a clock that advances by a tenth of a second at every reading."""
     ticking = count()
     return Hooks(now_s=lambda: next(ticking) * 0.1, report=report, should_stop=should_stop)
+
+
+def card_of(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint says of its training."""
+    with safe_open(path, framework="pt") as file:
+        card: dict[str, Any] = json.loads(file.metadata()[TRAINING_KEY])
+    return card
 
 
 def weights_of(path: Path) -> dict[str, bytes]:

@@ -133,7 +133,6 @@ def test_reset_begins_again_from_the_altitude_of_now() -> None:
 def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(kind: ActionKind) -> None:
     policy, flown = fly("doublet", 15.0 + doublet_length_s(kind), Vehicle(kind))
     start_s = policy.program_start_s
-    assert start_s is not None
     for step in doublet_steps(kind):
         middle_s = step.begin_s + step.half_s
         ends_s = (middle_s, step.end_s, step.end_s + step.settle_s)

@@ -43,15 +43,14 @@ class Pilot:
         for _ in range(round(seconds * NS_PER_S / STEP_NS)):
             self.ap.step()
 
-    def take_off(self, height_m: float = 5.0, mode: Mode = Mode.ALT_HOLD) -> None:
-        """Arm in ALT_HOLD, climb, level off, change the mode."""
+    def take_off(self, height_m: float = 5.0) -> None:
+        """Arm in ALT_HOLD, climb, level off."""
         self.hold(3.5, thr=1000)
         assert self.ap.set_mode(Mode.ALT_HOLD)
         assert self.ap.arm(force=False), self.texts()
         while self.height_m < height_m:
             self.hold(0.1, thr=2000)
         self.hold(3.0)
-        assert self.ap.set_mode(mode)
         self.ap.texts.clear()
 
     @property

@@ -2,8 +2,9 @@
 
 import multiprocessing
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import chain, count, repeat
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -150,26 +151,22 @@ def test_no_other_student_goes_on_where_no_files_tell_two_apart(
         demonstrate(wanted[1])
 
 
-def test_an_interrupted_demonstration_is_unfinished(tmp_path: Path) -> None:
-    spec = DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=config(tmp_path))
-    answers = chain(repeat(False, 2_000), repeat(True))  # 5 s of vehicle steps
-    with pytest.raises(EpisodeInterruptedError):
-        fly_demonstration(spec, lambda: next(answers))
-    assert not open_flight(spec.folder).meta.finished
+def kill_the_writer() -> bool:
+    for child in multiprocessing.active_children():
+        child.kill()
+    return False
 
 
-def test_a_demonstration_without_its_images_has_failed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("act", "error"), [(lambda: True, EpisodeInterruptedError), (kill_the_writer, WriterDiedError)]
+)
+def test_a_demonstration_that_is_interrupted_or_loses_its_images_is_unfinished(
+    tmp_path: Path, act: Callable[[], bool], error: type[Exception]
+) -> None:
     spec = DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=config(tmp_path))
     steps = count()
-
-    def kill_the_writer() -> bool:
-        if next(steps) == 2_000:  # 5 s of vehicle steps
-            for child in multiprocessing.active_children():
-                child.kill()
-        return False
-
-    with pytest.raises(WriterDiedError):
-        fly_demonstration(spec, kill_the_writer)
+    with pytest.raises(error):
+        fly_demonstration(spec, lambda: next(steps) >= 2_000 and act())  # 5 s of vehicle steps
     assert not open_flight(spec.folder).meta.finished
 
 
@@ -213,10 +210,8 @@ class Single:
 def test_a_student_without_a_checkpoint_flies(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(STUDENT)
     spec = f"{tmp_path}/mine.py:Single"
-    assert (
-        demonstrate(replace(config(tmp_path / "a", max_time=1.0), policy=PolicyConfig(policy=spec)))
-        == 0
-    )
+    asked = replace(config(tmp_path / "a", max_time=1.0), policy=PolicyConfig(policy=spec))
+    assert demonstrate(asked) == 0
     meta = open_flight(tmp_path / "a/000000").meta
     assert (meta.source, meta.policy, meta.mode, meta.action_hz) == ("dagger", spec, "single", 30)
     assert list(meta.policy_files) == [f"{tmp_path}/mine.py"]

@@ -92,9 +92,8 @@ def test_images_later_than_the_age_limit_are_not_flown_by() -> None:
 
 def test_a_flight_says_why_the_policy_lost_control() -> None:
     config = EvaluateConfig(policy=CIRCLE, max_time=6.0, stalls=1500.0)
-    lost = fly_simulated(EpisodeSpec(config=config, index=0), lambda: False).result.lost
-    assert lost is not None
-    assert lost.codes == (Code.LATE,)
+    flown = fly_simulated(EpisodeSpec(config=config, index=0), lambda: False)
+    assert flown.result.lost.codes == (Code.LATE,)
 
 
 def flown(spec: EpisodeSpec) -> FlownEpisode:

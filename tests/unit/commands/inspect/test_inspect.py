@@ -142,7 +142,6 @@ def test_chunks_that_stand_for_most_slots_do_not_change_the_stick_rate(tmp_path:
 def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Path) -> None:
     steady = [make_tick(index, predict_ns=4 * NS_PER_MS) for index in range(100)]
     outcome = read_meta(GOLDEN / "toge_ardupilot").outcome
-    assert outcome is not None
     meta = make_meta(policy="toge").with_outcome(replace(outcome, gates_passed=5))
     second = FlightAnalysis(write(tmp_path / "second", steady, meta=meta))
     lines = shown(FlightAnalysis(stalled), second).splitlines()

@@ -102,14 +102,21 @@ def test_doubtful_entries_are_warnings(folder):
     assert any("numbers [12]" in note for note in notes)  # never changed in training
 
 
-def test_entries_that_older_versions_lack_have_the_value_of_then(folder):
+def test_entries_that_older_versions_lack_or_that_are_null_have_the_value_of_then(folder):
     def older(data):
         for name in ("resize_shape", "crop_ratio", "compile_model", "compile_mode", "use_peft"):
             del data[name]
 
+    def empty(data):
+        data["steps"][0]["config"] = {"rename_map": None}
+        data["steps"][3]["config"]["eps"] = None
+
     before = read_plan(folder, None)
     edit(folder / "config.json", older)
-    assert read_plan(folder, None).config == before.config
+    edit(folder / "policy_preprocessor.json", empty)
+    after = read_plan(folder, None)
+    assert after.config == before.config
+    np.testing.assert_equal(asdict(after.normalisation), asdict(before.normalisation))
 
 
 def test_a_folder_above_is_told_from_one_that_holds_nothing(folder, tmp_path):
@@ -155,16 +162,6 @@ def test_a_contract_that_contradicts_the_policy_is_refused(folder, contract, sai
     (folder / "mavbridge.toml").write_text(CONTRACT + contract + "\n")
     with pytest.raises(ContractError, match=said):
         read_plan(folder, None)
-
-
-def test_entries_of_a_processor_that_are_null_are_as_missing_ones(folder):
-    def empty(data):
-        data["steps"][0]["config"] = {"rename_map": None}
-        data["steps"][3]["config"]["eps"] = None
-
-    before = read_plan(folder, None).normalisation
-    edit(folder / "policy_preprocessor.json", empty)
-    np.testing.assert_equal(asdict(read_plan(folder, None).normalisation), asdict(before))
 
 
 def test_a_renamed_camera_is_known_by_both_names(folder):

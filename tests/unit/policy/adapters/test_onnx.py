@@ -251,10 +251,8 @@ def test_a_history_that_is_declared_flat_is_given_flat(tmp_path: Path, dim: int 
         helper.make_node("Cos", ["action_history"], ["ones"]),
         helper.make_node("MatMul", ["ones", "w"], ["actions"]),
     ]
-    inputs, outputs = (
-        {"action_history": (graphs.FLOAT, (dim, 16))},
-        {"actions": (graphs.FLOAT, ("n", "m"))},
-    )
+    inputs = {"action_history": (graphs.FLOAT, (dim, 16))}
+    outputs = {"actions": (graphs.FLOAT, ("n", "m"))}
     graphs.save_graph(tmp_path / "policy.onnx", nodes, inputs, outputs, {"w": weight})
     assert act(fly(f"onnx:{tmp_path}")).tolist() == [[8.0] * 4]
 
@@ -269,15 +267,9 @@ def test_a_graph_without_an_axis_for_the_batch_is_given_none(tmp_path: Path) -> 
         helper.make_node("Add", ["four", "by_state"], ["scores"]),
         helper.make_node("Softmax", ["scores"], ["actions"], axis=0),
     ]
-    inputs: dict[str, tuple[int, tuple[int, ...]]] = {
-        "image": (graphs.FLOAT, (3, graphs.IMAGE_PX, graphs.IMAGE_PX)),
-        "obs": (graphs.FLOAT, (13,)),
-    }
-    weights = {
-        "sides": np.array([1, 2]),
-        "zero": np.zeros(1, np.float32),
-        "w": np.zeros((13, 4), np.float32),
-    }
+    image = (graphs.FLOAT, (3, graphs.IMAGE_PX, graphs.IMAGE_PX))
+    inputs = {"image": image, "obs": (graphs.FLOAT, (13,))}
+    weights = {"sides": np.array([1, 2]), "zero": np.zeros(1, "f4"), "w": np.zeros((13, 4), "f4")}
     outputs = {"actions": (graphs.FLOAT, (4,))}
     graphs.save_graph(tmp_path / "policy.onnx", nodes, inputs, outputs, weights)
     runner = fly(f"onnx:{tmp_path}")
@@ -381,12 +373,9 @@ def growing(path: Path) -> None:
         helper.make_node("ReduceMean", ["kv_out", "axis"], ["mean"], keepdims=0),
         helper.make_node("MatMul", ["mean", "w"], ["actions"]),
     ]
-    outputs: dict[str, tuple[int, Any]] = {
-        "actions": (graphs.FLOAT, (1, 4)),
-        "kv_out": (graphs.FLOAT, (1, "all", 13)),
-    }
     weights = {"axis": np.array([1]), "w": np.eye(13, 4, dtype=np.float32)}
     inputs = {"obs": (graphs.FLOAT, STATE), "kv_in": (graphs.FLOAT, (1, "past", 13))}
+    outputs = {"actions": (graphs.FLOAT, (1, 4)), "kv_out": (graphs.FLOAT, (1, "all", 13))}
     graphs.save_graph(path, nodes, inputs, outputs, weights)
 
 

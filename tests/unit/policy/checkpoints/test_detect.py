@@ -21,8 +21,8 @@ PI0 = json.dumps({"type": "pi0", "input_features": {}, "output_features": {}})
 SAFETENSORS, TORCH = "model.safetensors", "model.pt"
 
 
-def tensors(*names: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
-    return {name: torch.zeros(2, 2, dtype=dtype) for name in names}
+def tensors(*names: str) -> dict[str, torch.Tensor]:
+    return {name: torch.zeros(2, 2) for name in names}
 
 
 def saved(content: object, **options: bool) -> bytes:

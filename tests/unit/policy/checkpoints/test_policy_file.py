@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from policy.checkpoints.header import read_contract
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
-from policy.checkpoints.tensors import pack, unpack
+from policy.checkpoints.tensors import pack, read_tensors, unpack
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
@@ -29,16 +28,6 @@ def saved(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def header_of(path: Path) -> dict[str, str]:
-    with safe_open(path, framework="pt") as file:
-        return dict(file.metadata())
-
-
-def contents_of(path: Path) -> dict[str, torch.Tensor]:
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-
-
 def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     contract = Contract(image_height=32, image_width=48, state_frame="enu_flu", horizon=8)
     schedule = NoiseSchedule(betas="linear", num_train_timesteps=50)
@@ -46,7 +35,7 @@ def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     policy = build_policy(config).eval()
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, policy)
-    assert contents_of(path)["test_vector.chunks"].abs().max() > 0.1
+    assert read_tensors(path)[1]["test_vector.chunks"].abs().max() > 0.1
     loaded = load_checkpoint(path, fallback=BuiltinConfig())
     assert loaded.config == policy.config
     assert not loaded.training
@@ -98,7 +87,7 @@ Change = str | dict[str, Any] | None
 def test_headers_of_another_build_are_refused(
     saved: Path, tmp_path: Path, key: str, change: Change, message: str
 ) -> None:
-    header, path = header_of(saved), tmp_path / "a.safetensors"
+    header, path = read_tensors(saved)[0], tmp_path / "a.safetensors"
     text = header.pop(key)
     if change is not None:
         merged = json.dumps({**json.loads(text), **change}) if isinstance(change, dict) else change
@@ -129,12 +118,12 @@ def test_headers_of_another_build_are_refused(
 def test_weights_that_are_not_those_that_were_saved_are_refused(
     small_toge, saved, tmp_path, name, change, message
 ):
-    contents = contents_of(saved)
+    header, contents = read_tensors(saved)
     before = contents.pop(name)
     if change is not None:
         contents[name] = change(before).contiguous()
     path = tmp_path / "a.safetensors"
-    save_file(contents, path, metadata=header_of(saved))
+    save_file(contents, path, metadata=header)
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(path, fallback=small_toge.config)
 

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 
 from helpers.flight_folders import MS, spot, ticks_table, write_flight, write_spot_flight
-from helpers.training_runs import make_hooks, weights_of
-from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
+from helpers.training_runs import card_of, make_hooks, weights_of
+from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData, hold_out
 from policy.data.flight_folders import read_flight
@@ -81,14 +80,11 @@ def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
     asked = settings(tmp_path, steps=60, batch_size=16, disturb=False)
     result = run(flights, asked)
     held_out = result.validation
-    assert held_out is not None
     assert held_out.stick_error < 0.6 * held_out.mean_stick_error
-    assert held_out.hold_error is not None
     assert held_out.stick_error < 0.6 * held_out.hold_error
     policy = load_checkpoint(result.checkpoint, fallback=NETWORK)
     assert policy.contract == replace(CONTRACT, feature_dim=256)
-    with safe_open(result.checkpoint, framework="pt") as file:
-        card = json.loads(file.metadata()[TRAINING_KEY])
+    card = card_of(result.checkpoint)
     assert (card["flights"], card["batch_size"]) == (3, 16)
     low_ms, high_ms = card["feature_ages_ms"]
     assert 40 <= low_ms < high_ms <= 75
@@ -142,9 +138,7 @@ def test_ages_of_a_camera_that_paused_are_not_learned(flights, tmp_path):
     measured = write_flight(tmp_path / "ages", table, captured_ns=[10**9], images=[spot(32, 0.0)])
     asked = settings(tmp_path, steps=1, validations=1, ages=str(measured))
     run(flights, asked)
-    with safe_open(asked.out, framework="pt") as file:
-        card = json.loads(file.metadata()[TRAINING_KEY])
-    assert card["feature_ages_ms"] == [10.0, 1000.0]
+    assert card_of(asked.out)["feature_ages_ms"] == [10.0, 1000.0]
     table = ticks_table(woke_ns=woke, expert=None, sent=[None] * 600, captured_ns=[-(10**9)] * 600)
     write_flight(tmp_path / "old", table, captured_ns=[10**9], images=[spot(32, 0.0)])
     with pytest.raises(DatasetError, match="each image in it was over 1000 ms old"):
@@ -171,7 +165,6 @@ def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
 def test_by_rates_no_error_of_a_held_stick_is_told(flights, tmp_path):
     by_rates = replace(NETWORK, contract=replace(CONTRACT, action="rates", modes=()))
     held_out = run(flights, settings(tmp_path, validations=1), network=by_rates).validation
-    assert held_out is not None
     assert held_out.hold_error is None
     assert "held)" not in held_out.describe()
     assert "(mean stick" in held_out.describe()
@@ -285,7 +278,6 @@ def test_gate_labels_leave_out_what_no_camera_sees() -> None:
     assert labels[1].isnan().all()
     made = torch.zeros(2, 10, requires_grad=True)
     gate_loss(made, torch.tensor([ahead, behind])).backward()  # type: ignore[no-untyped-call]
-    assert made.grad is not None
     assert made.grad.isfinite().all()
     assert not made.grad[1].any()
 

@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 
 from helpers.steered_flights import steered_flight
-from helpers.training_runs import SMALL_WORLD, make_hooks, weights_of
-from policy.checkpoints.networks import TRAINING_KEY
+from helpers.training_runs import SMALL_WORLD, card_of, make_hooks, weights_of
 from policy.data.flight_data import FlightData
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
@@ -20,7 +18,7 @@ from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.nets.world_model.motion import motion_since
 from policy.training.batches import FeatureStore, encode_frames
-from policy.training.report import TrainingProgress, TrainResult, WorldModelValidation
+from policy.training.report import TrainingProgress, TrainResult
 from policy.training.settings import WorldModelSettings
 from policy.training.world_model_losses import (
     CONTEXT_NOISE,
@@ -84,7 +82,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, Worl
 def test_sticks_tell_how_the_vehicle_will_move(trained):
     result, made = trained
     held_out = result.validation
-    assert isinstance(held_out, WorldModelValidation)
     assert held_out.velocity_error_mps < 0.5 * held_out.held_velocity_error_mps
     log = [json.loads(line) for line in (made.work_folder / "log.jsonl").read_text().splitlines()]
     for stage in ("autoencoder", "dynamics"):
@@ -97,8 +94,7 @@ def test_sticks_tell_how_the_vehicle_will_move(trained):
 
 
 def test_a_checkpoint_says_how_it_was_trained(trained):
-    with safe_open(trained[0].checkpoint, framework="pt") as file:
-        card = json.loads(file.metadata()[TRAINING_KEY])
+    card = card_of(trained[0].checkpoint)
     assert card["flights"] == 5
     assert card["images"] == 5 * 91
     assert card["windows"] == 5 * 76
