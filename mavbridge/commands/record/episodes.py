@@ -27,6 +27,8 @@ KEYS = (QUIT_KEY, TOGGLE_KEY, " ", GOOD_KEY, BAD_KEY)
 KEYS_HINT = "r or space begins and ends an episode, g marks it as good, b as bad, q ends"
 AFTER_DISARM_NS = NS_PER_S
 """Recording time after disarming, in which a fall shows if the vehicle was in the air."""
+MAX_READINGS = 60_000
+"""Readings of the switch while an episode is closed, for ``CLOSE_S`` at the fastest rate."""
 MIDDLE_NS = 300 * NS_PER_MS
 """A switch on its way from high to low passes the middle within this time."""
 
@@ -35,10 +37,18 @@ _MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 
 
 class EpisodeControl:
-    """Decides when an episode is wanted. Call ``step`` about twenty times a second."""
+    """Decides when an episode is wanted; a ``TickSink`` of the readings of the switch.
 
-    def __init__(self, *, on_arm: bool) -> None:
+    Call ``step`` about twenty times a second. Closing an episode takes longer, and the switch is
+    also moved meanwhile.
+    """
+
+    def __init__(self, *, on_arm: bool, channel: int | None = None) -> None:
+        """``channel``: number of the switch's radio channel, from 1; None: no switch."""
         self._on_arm = on_arm
+        self._channel = channel
+        self._readings: deque[tuple[int, int]] = deque(maxlen=MAX_READINGS)
+        """Stamp and pulse width of each reading since the last step."""
         self._switch = Switch(rests=("low", "middle"))
         self._position: Position | None = None
         """Last known position, kept through readings without one."""
@@ -52,13 +62,20 @@ class EpisodeControl:
         self.ended_by = ""
         """What last asked for an end."""
 
-    def step(self, now_ns: int, *, armed: bool, switch_us: int = 0, keys: str = "") -> Mark | None:
+    def emit(self, event: Event) -> None:
+        """Keep the reading of the switch for the next step."""
+        if self._channel is not None and isinstance(event, Tick):
+            for switch_us in event.rc_channels_us[self._channel - 1 : self._channel]:
+                self._readings.append((event.woke_ns, switch_us))
+
+    def step(self, now_ns: int, *, armed: bool, keys: str = "") -> Mark | None:
         """Advance to this time; return a mark for the current episode, or else for the last one.
 
-        ``switch_us`` is the pulse width of the switch's channel, 0 without one; ``keys`` were
-        typed since the last step, in order.
+        ``keys`` were typed since the last step, in order.
         """
-        mark = self._by_switch(now_ns, switch_us)
+        mark: Mark | None = None
+        for _ in range(len(self._readings)):
+            mark = self._by_switch(*self._readings.popleft()) or mark
         if self._on_arm:
             self._by_arming(now_ns, armed)
         for key in keys:

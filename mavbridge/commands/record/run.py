@@ -91,7 +91,7 @@ class _Session:
         self._clock = clock
         self._stack = stack
         self._keys: deque[str] = deque(maxlen=MAX_KEYS)
-        self._control = EpisodeControl(on_arm=config.on_arm)
+        self._control = EpisodeControl(on_arm=config.on_arm, channel=config.episode_channel)
         self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
@@ -118,7 +118,7 @@ class _Session:
             autopilot=lambda: self._view.status.autopilot,
             report=self._screen.show_message,
         )
-        sink = FanOut(filter(None, (self._screen, self._episodes, viewer)))
+        sink = FanOut(filter(None, (self._screen, self._episodes, self._control, viewer)))
         self._view = PilotView(
             plan,
             sink=sink,
@@ -174,11 +174,10 @@ class _Session:
         """Update the episodes and the status line; return False when the session is over."""
         self._look_at_disk()
         keys = "".join(self._keys.popleft() for _ in range(len(self._keys)))
-        status = self._view.status
-        channels_us = dict(enumerate(status.rc_channels_us, start=1))
-        switch_us = channels_us.get(self._config.episode_channel or 0, 0)
         mark = self._control.step(
-            self._clock.now_ns(), armed=status.armed, switch_us=switch_us, keys=keys
+            self._clock.now_ns(),
+            armed=self._view.status.armed,
+            keys=keys,
         )
         if mark is not None:
             self._episodes.mark(mark)

@@ -1,18 +1,19 @@
 import pytest
 
+from helpers.factories import make_tick
 from mavbridge.commands.record.episodes import EpisodeControl
 from mavbridge.core.clock import NS_PER_MS
 
 STEP_NS = 50 * NS_PER_MS
 LOW, MIDDLE, HIGH = 1000, 1500, 2000
+CHANNEL = 7
 
 
 class Session:
     """Records what is wanted, as a recording session does."""
 
     def __init__(self, *, has_switch: bool = False, on_arm: bool = False) -> None:
-        self.control = EpisodeControl(on_arm=on_arm)
-        self.has_switch = has_switch
+        self.control = EpisodeControl(on_arm=on_arm, channel=CHANNEL if has_switch else None)
         self.now_ns = 0
         self.is_recording = False
         self.may_begin = True
@@ -23,9 +24,8 @@ class Session:
         """What was done in these steps."""
         done: list[str] = []
         for _ in range(times):
-            self.now_ns += STEP_NS
-            read_us = switch_us if self.has_switch else 0
-            mark = self.control.step(self.now_ns, armed=armed, switch_us=read_us, keys=keys)
+            self.read(switch_us)
+            mark = self.control.step(self.now_ns, armed=armed, keys=keys)
             keys, wanted = "", self.control.wanted is not None
             if mark is not None:
                 done.append(mark)
@@ -33,6 +33,13 @@ class Session:
                 self.is_recording = wanted
                 done.append("begin" if wanted else "end")
         return done
+
+    def read(self, switch_us: int, *, times: int = 1) -> None:
+        """Readings of the switch without a step, as while an episode is closed."""
+        for _ in range(times):
+            self.now_ns += STEP_NS
+            channels_us = (*[MIDDLE] * (CHANNEL - 1), switch_us, MIDDLE)
+            self.control.emit(make_tick(woke_ns=self.now_ns, rc_channels_us=channels_us))
 
     def crash(self) -> None:
         """The episode ends by itself, as also with a full disk."""
@@ -71,6 +78,16 @@ def test_a_switch_records_while_it_is_high_and_its_middle_marks_as_bad() -> None
         (MIDDLE, 20, []),  # it did not come from high
     ):
         assert session.step(switch_us=switch_us, times=times) == done, (switch_us, times)
+
+
+def test_the_switch_is_read_while_an_episode_is_closed() -> None:
+    session = Session(has_switch=True)
+    session.step(switch_us=LOW, times=5)
+    session.step(switch_us=HIGH, times=5)
+    assert session.step(switch_us=LOW) == ["end"]
+    session.read(LOW, times=20)
+    session.read(HIGH, times=20)
+    assert session.step(switch_us=HIGH) == ["begin"]
 
 
 @pytest.mark.parametrize(
