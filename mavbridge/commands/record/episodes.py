@@ -53,7 +53,9 @@ class EpisodeControl:
         self._position: Position | None = None
         """Last known position, kept through readings without one."""
         self._middle_since_ns: int | None = None
-        """Time at which the switch moved from high to the middle."""
+        """Time at which the switch moved from high to the middle after an episode."""
+        self._is_taken = False
+        """True if an episode has been in progress since the switch went high."""
         self._was_armed = False
         self._disarmed_ns: int | None = None
         self.wanted: str | None = None
@@ -68,14 +70,19 @@ class EpisodeControl:
             for switch_us in event.rc_channels_us[self._channel - 1 : self._channel]:
                 self._readings.append((event.woke_ns, switch_us))
 
-    def step(self, now_ns: int, *, armed: bool, keys: str = "") -> Mark | None:
+    @property
+    def may_mark(self) -> bool:
+        """True if the switch may be about to mark the last episode."""
+        return self._middle_since_ns is not None
+
+    def step(self, now_ns: int, *, armed: bool, is_recording: bool, keys: str = "") -> Mark | None:
         """Advance to this time; return a mark for the current episode, or else for the last one.
 
         ``keys`` were typed since the last step, in order.
         """
         mark: Mark | None = None
         for _ in range(len(self._readings)):
-            mark = self._by_switch(*self._readings.popleft()) or mark
+            mark = self._by_switch(*self._readings.popleft(), is_recording) or mark
         if self._on_arm:
             self._by_arming(now_ns, armed)
         for key in keys:
@@ -90,16 +97,17 @@ class EpisodeControl:
         else:
             self.wanted, self.ended_by = None, by
 
-    def _by_switch(self, now_ns: int, switch_us: int) -> Mark | None:
+    def _by_switch(self, now_ns: int, switch_us: int, is_recording: bool) -> Mark | None:
         is_act = self._switch.read(switch_us, now_ns)
         before, now = self._position, self._switch.position or self._position
+        self._is_taken = is_recording or (self._is_taken and before == "high")
         self._position = now
         if now == "high":
             self._middle_since_ns = None
             if is_act:
                 self._want(True, "the switch")
         elif before == "high":
-            self._middle_since_ns = now_ns if now == "middle" else None
+            self._middle_since_ns = now_ns if now == "middle" and self._is_taken else None
             self._want(False, "the switch")
         elif now == "low":
             self._middle_since_ns = None

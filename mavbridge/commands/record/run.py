@@ -177,6 +177,7 @@ class _Session:
         mark = self._control.step(
             self._clock.now_ns(),
             armed=self._view.status.armed,
+            is_recording=self._episodes.current is not None,
             keys=keys,
         )
         if mark is not None:
@@ -192,7 +193,8 @@ class _Session:
             problem=self._missing() or self._doubt(),
         )
         wanted = self._config.episodes
-        return wanted is None or self._episodes.counts.total() < wanted
+        is_over = wanted is not None and self._episodes.counts.total() >= wanted
+        return not is_over or self._control.may_mark
 
     def _follow(self) -> None:
         """Begin or end an episode as the control wants it."""

@@ -25,7 +25,9 @@ class Session:
         done: list[str] = []
         for _ in range(times):
             self.read(switch_us)
-            mark = self.control.step(self.now_ns, armed=armed, keys=keys)
+            mark = self.control.step(
+                self.now_ns, armed=armed, is_recording=self.is_recording, keys=keys
+            )
             keys, wanted = "", self.control.wanted is not None
             if mark is not None:
                 done.append(mark)
@@ -78,6 +80,34 @@ def test_a_switch_records_while_it_is_high_and_its_middle_marks_as_bad() -> None
         (MIDDLE, 20, []),  # it did not come from high
     ):
         assert session.step(switch_us=switch_us, times=times) == done, (switch_us, times)
+
+
+def test_the_middle_marks_only_an_episode_of_this_move_of_the_switch() -> None:
+    session = Session(has_switch=True)
+    session.step(switch_us=LOW, times=5)
+    assert session.step(switch_us=HIGH, times=5) == ["begin"]
+    assert session.step(switch_us=LOW, times=5) == ["end"]
+    assert session.step(switch_us=LOW, keys="g") == ["good"]
+    session.may_begin = False
+    assert session.step(switch_us=HIGH, times=5) == []
+    assert session.step(switch_us=MIDDLE, times=20) == [], "the good one stays good"
+    session.may_begin = True
+    assert session.step(switch_us=HIGH, times=6) == ["begin"]
+    session.crash()
+    assert session.step(switch_us=HIGH, times=5) == []
+    assert session.step(switch_us=MIDDLE, times=20) == ["bad"]
+
+
+@pytest.mark.parametrize(("after", "marks"), [(MIDDLE, ["bad"]), (LOW, [])])
+def test_the_last_episode_waits_for_its_mark(after: int, marks: list[str]) -> None:
+    session = Session(has_switch=True)
+    session.step(switch_us=LOW, times=5)
+    session.step(switch_us=HIGH, times=5)
+    assert not session.control.may_mark
+    assert session.step(switch_us=MIDDLE) == ["end"]
+    assert session.control.may_mark
+    assert session.step(switch_us=after, times=7) == marks
+    assert not session.control.may_mark
 
 
 def test_the_switch_is_read_while_an_episode_is_closed() -> None:
