@@ -354,8 +354,11 @@ def with_config(
             )
         cli.config = [Settings(document, source=str(config))]
     if print_config:
-        asks = config is not None or any(word.startswith("-") for word in words)
-        asked = list(cli.parse_args(words)[1].arguments.values())[-1] if asks else None
+        asked = None
+        if config is not None or any(word.startswith("-") for word in words):
+            bound = cli.parse_args(words)[1]
+            bound.apply_defaults()
+            *_, asked = bound.arguments.values()
         print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli, asked)
         return 0
     with run_log(log_file, verbose=verbose):

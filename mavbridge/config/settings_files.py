@@ -171,6 +171,13 @@ def _toml(value: Any) -> str | None:
         return str(value).lower()
     if isinstance(value, int | float):
         return str(value)
-    if isinstance(value, tuple) and value:
-        return json.dumps(value)
-    return json.dumps(str(value)) if isinstance(value, str | Path) and value else None
+    value = str(value) if isinstance(value, Path) else value
+    if not (isinstance(value, tuple | str) and value):
+        return None
+    # JSON has two escapes for a character beyond 16 bits, and TOML one.
+    return re.sub(r"\\ud[89ab]..\\ud[c-f]..", _long_escape, json.dumps(value))
+
+
+def _long_escape(pair: re.Match[str]) -> str:
+    character = json.loads(f'"{pair[0]}"')
+    return f"\\U{ord(character):08x}"

@@ -44,11 +44,23 @@ def test_what_the_command_line_asks_for_is_printed_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = (*VEHICLE, "--arm", "--camera=a=none", "--set-config", "envelope.height=20")
+    asked += ("--record", "é 🚁 \\ud83d\\ude81 \x7f", "--camera=b=🚁🚁.mp4")
     first, path = tmp_path / "first.toml", tmp_path / "all.toml"
     first.write_text("[limits]\nslew = 3\n")
     assert status_of(*asked, "--config", first, "--print-config") == 0
     path.write_text(capsys.readouterr().out)
     assert asked_flight("--config", path) == asked_flight(*asked, "--config", first)
+
+
+@pytest.mark.parametrize("words", [(), ("fly",), ("check",), ("inspect", "a"), ("replay", "a")])
+def test_a_file_that_asks_for_nothing_is_printed_as_the_defaults(
+    words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (path := tmp_path / "own.toml").touch()
+    assert status_of(*words, "--config", path, "--print-config") == 0
+    printed = capsys.readouterr().out
+    assert status_of(*words[:1], "--print-config") == 0
+    assert capsys.readouterr().out == printed
 
 
 def test_a_section_whose_keys_are_all_commented_out_asks_for_nothing(tmp_path: Path) -> None:
