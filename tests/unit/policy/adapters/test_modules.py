@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from helpers.loaded_policies import act, load, require_same
-from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser
+from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser, scripted
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
@@ -116,23 +116,11 @@ def weights() -> bytes:
     return buffer.getvalue()
 
 
-class Branching(nn.Module):
-    def forward(self, image: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        chunk = torch.zeros(1, 8, 4)
-        if bool(state[0, 0] > 0):
-            chunk += 0.5
-        return chunk
-
-
 def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
-    path = archive(tmp_path, Branching(), described())
+    decides = "torch.zeros(1, 8, 4) + (0.5 if bool(state[0, 0] > 0) else 0.0)"
+    path = archive(tmp_path, scripted("image, state", decides), described())
     runner = load(f"torchscript:{path}", dual_rate=False).runner
     assert [act(runner, vx_mps=vx)[0, 0] for vx in (1.0, -1.0)] == [0.5, 0.0]
-
-
-class Settable(nn.Module):
-    def forward(self, state: torch.Tensor, sample: bool = False) -> torch.Tensor:
-        return torch.full((1, 8, 4), float(sample)) + state.sum()
 
 
 def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
@@ -140,7 +128,8 @@ def test_optional_settings_keep_their_defaults(tmp_path: Path) -> None:
         load(f"{MINE}:{name}", dual_rate=False).runner for name in ("ForwardOnly", "Settable")
     )
     require_same(plain, settable)
-    path = archive(tmp_path, Settable(), described())
+    settable = scripted("state, scale: float = 1.0", "torch.zeros(1, 8, 4) + scale * state.sum()")
+    path = archive(tmp_path, settable, described())
     runner = load(f"torchscript:{path}", dual_rate=False).runner
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(act(runner)[0, 0] + 0.5, abs=1e-3)
 
@@ -153,41 +142,20 @@ def test_wrapped_modules_get_the_arguments_that_they_declare() -> None:
     require_same(plain, wrapped)
 
 
-class Flattening(nn.Module):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(1, 8, 4) + x.flatten()[0]
-
-
 def test_one_input_that_may_be_a_state_or_an_image_is_not_guessed(tmp_path: Path) -> None:
-    path = archive(tmp_path, Flattening(), described())
+    flattening = scripted("x", "torch.zeros(1, 8, 4) + x.flatten()[0]")
+    path = archive(tmp_path, flattening, described())
     with pytest.raises(PolicyError, match=r"its x may be a state or an image.*policy\.json"):
         load(f"torchscript:{path}", dual_rate=False)
-    path = archive(tmp_path, Flattening(), described(inputs={"state": "x"}))
+    path = archive(tmp_path, flattening, described(inputs={"state": "x"}))
     runner = load(f"torchscript:{path}", dual_rate=False).runner
     assert act(runner, vx_mps=0.5)[0, 0] == pytest.approx(0.5, abs=1e-3)
 
 
-class TwoChunks(nn.Module):
-    def forward(self, image: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(2, 1, 8, 4) + state.sum()
-
-
-def test_more_chunks_than_one_are_refused_by_their_shape(tmp_path: Path) -> None:
-    path = archive(tmp_path, TwoChunks(), described())
-    with pytest.raises(
-        PolicyError, match=r"must be \[1, 8, 4\] by its contract, got \[2, 1, 8, 4\]"
-    ):
-        load(f"torchscript:{path}", dual_rate=False)
-
-
-class ImageAsObs(nn.Module):
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return (torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)
-
-
 @pytest.mark.parametrize("inputs", [{"image": "obs"}, {}])
 def test_an_observation_that_only_an_image_fits_is_one(tmp_path: Path, inputs: object) -> None:
-    path = archive(tmp_path, ImageAsObs(), described(inputs=inputs))
+    mean = scripted("obs", "(torch.zeros(1, 8, 4) + obs.mean(dim=(1, 2, 3))).to(torch.bfloat16)")
+    path = archive(tmp_path, mean, described(inputs=inputs))
     runner = load(f"torchscript:{path}", engine="torch", dual_rate=False).runner
     assert act(runner, level=255)[0, 0] > act(runner, level=0)[0, 0]
 
@@ -199,21 +167,18 @@ def test_an_input_that_fits_nothing_is_refused_with_both_reasons(tmp_path: Path)
         load(f"torchscript:{path}", dual_rate=False)
 
 
-class StateFirst(nn.Module):
-    def forward(self, state: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(1, 8, 4) + state.mean() + image.mean()
-
-
-class NoState(nn.Module):
-    def forward(self, image: torch.Tensor, history: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(1, 8, 4) + image.mean() + history.mean()
-
-
-@pytest.mark.parametrize("module", [StateFirst(), NoState()])
-def test_arguments_in_another_order_are_refused(tmp_path: Path, module: nn.Module) -> None:
-    path = archive(tmp_path, module, described())
-    with pytest.raises(PolicyError, match="image, state, action_history, passed in this order"):
-        load(f"torchscript:{path}")
+@pytest.mark.parametrize(
+    ("signature", "shape", "told"),
+    [
+        ("state, image", (1, 8, 4), "image, state, action_history, passed in this order"),
+        ("image, history", (1, 8, 4), "image, state, action_history, passed in this order"),
+        ("image, state", (2, 1, 8, 4), r"must be \[1, 8, 4\] by its contract, got \[2, 1, 8, 4\]"),
+    ],
+)
+def test_other_arguments_and_chunks_are_refused(tmp_path, signature, shape, told):
+    path = archive(tmp_path, scripted(signature, f"torch.zeros({shape})"), described())
+    with pytest.raises(PolicyError, match=told):
+        load(f"torchscript:{path}", dual_rate=False)
 
 
 class Normed(nn.Module):

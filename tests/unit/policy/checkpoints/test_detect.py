@@ -50,11 +50,7 @@ FILES: list[tuple[str, Callable[[], bytes], str]] = [
     (TORCH, lambda: b"", "is empty, or cut short: copy it again"),
     (SAFETENSORS, lambda: LFS, "is a pointer of Git LFS.*git lfs pull"),
     ("m.onnx", lambda: b"\x08\x08\x12\x07pytorch", r"--policy onnx:.*m\.onnx"),
-    (
-        TORCH,
-        lambda: zipped("m/data.pkl", "m/code/m.py"),
-        r"TorchScript archive.*torchscript:.*\.pt",
-    ),
+    (TORCH, lambda: zipped("m/data.pkl", "m/code/m.py"), "TorchScript archive.*torchscript:"),
     ("m.zip", lambda: zipped("a/weights.bin"), "a zip archive: unpack"),
     ("m.pt2", lambda: zipped("m/archive_format"), r"a program of torch\.export: .*--policy onnx:"),
     (
