@@ -21,6 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; by default that of the process."""
     if arguments is None:  # our process: its children import nothing from the working directory
         os.environ.setdefault(SAFE_PATH, OUR_SAFE_PATH)
+        open_closed_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # escape what its encoding lacks, as stderr does
         sys.stdout.reconfigure(errors="backslashreplace")
     if (problem := hidden_package()) is not None:
@@ -51,6 +52,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         console = SafeConsole(stderr=True, highlight=False, emoji=False)
         end(error.exit_code, partial(console.print, message, soft_wrap=True))
     end(status or 0)
+
+
+def open_closed_streams() -> None:
+    """Open closed standard streams on the null device: a link or a log would get their numbers."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", closefd=False))
 
 
 def hidden_package() -> str | None:

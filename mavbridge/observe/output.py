@@ -119,10 +119,10 @@ class _SurvivingText(io.TextIOWrapper):
 def survive_lost_readers() -> None:
     """Let standard output and error outlive their reader, so that a command finishes its files."""
     for name in ("stdout", "stderr"):
-        if (old := getattr(sys, name)) is not None:
-            buffer = io.BufferedWriter(io.FileIO(old.fileno(), "wb", closefd=False))
-            new = _SurvivingText(buffer, old.encoding, old.errors, line_buffering=True)
-            setattr(sys, name, new)
+        old = getattr(sys, name)
+        buffer = io.BufferedWriter(io.FileIO(old.fileno(), "wb", closefd=False))
+        new = _SurvivingText(buffer, old.encoding, old.errors, line_buffering=True)
+        setattr(sys, name, new)
 
 
 class _Lines(io.TextIOBase):

@@ -4,6 +4,7 @@ Whole flights of such a console are in tests/faults/catalogue: terminal-stalled,
 """
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from rich.console import Console
 
 from helpers.factories import make_tick
 from helpers.reports import report_of
+from mavbridge.core.processes import child_environment
 from mavbridge.observe.output import PatientOutput, stray_lines_shown
 from mavbridge.observe.terminal import FlightScreen
 
@@ -77,3 +79,16 @@ def test_a_stream_of_a_policy_that_is_no_file_keeps_its_lines(
     with (tmp_path / "console").open("w") as console, stray_lines_shown(pytest.fail, console):
         print("mine")
     assert kept == ["mine", "\n"]
+
+
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">&-", "2>&-"])
+def test_a_file_does_not_take_the_place_of_a_closed_stream(closed: str, tmp_path: Path) -> None:
+    """The guard would get the null device in place of its channel, and the log would be empty."""
+    code = "import os, sys; from mavbridge.__main__ import open_closed_streams as open_them; "
+    code += "open_them(); file = open('number', 'w'); file.write(str(file.fileno())); "
+    code += "from mavbridge.observe.output import survive_lost_readers; survive_lost_readers(); "
+    code += "print('out', file=sys.stdout, flush=True); print('err', file=sys.stderr, flush=True); "
+    code += "sys.exit(any(not os.get_inheritable(stream) for stream in range(3)))"
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", code]
+    subprocess.run(command, cwd=tmp_path, env=child_environment(), check=True)
+    assert int((tmp_path / "number").read_text()) > 2
