@@ -161,8 +161,10 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     _require_learnable(name, contract)
     course_seed = meta.get("course_seed")
     suffix = _camera_suffix(folder, contract.cameras, camera, damage)
-    frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
     video = folder / f"camera{suffix}.mp4"
+    if not (meta.get("frames") or video.exists() or any(folder.glob(f"frames{suffix}.*"))):
+        raise NothingToLearnError(f"{folder}: it ended before its first image")
+    frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
     if not video.is_file():
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)

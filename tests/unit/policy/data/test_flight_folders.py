@@ -180,6 +180,21 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
         leave_out_failed([tmp_path / "b"], include_failed=False)
 
 
+@pytest.mark.parametrize("frames", [0, None])
+def test_a_flight_without_an_image_is_left_out(tmp_path: Path, frames: int | None) -> None:
+    blind, seen = flight(tmp_path / "a", {"frames": frames}), flight(tmp_path / "b", {"seed": 1})
+    for name in ("camera.mp4", "frames.parquet"):
+        (blind / name).unlink()
+    flights, notes = read_flights([blind, seen])
+    assert [each.name for each in flights] == [str(seen)]
+    assert notes == [f"left out: {blind}: it ended before its first image"]
+    flight(tmp_path / "c", {"frames": 2})
+    (tmp_path / "c" / "camera.mp4").unlink()
+    (tmp_path / "c" / "frames.parquet").unlink()
+    with pytest.raises(DatasetError, match="no whole flight"):
+        read_flights([tmp_path / "c", seen])
+
+
 def test_no_flights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="x cannot be read: File name too long"):
         find_flights([tmp_path / ("x" * 300)])
