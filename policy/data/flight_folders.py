@@ -177,8 +177,8 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     # An action that the link refused does not fly: the one before it does.
     is_refused = (np.array(ticks["phase"]) == "flying") & ~_known(sent)
     flew = np.maximum.accumulate(np.where(is_refused, 0, np.arange(len(sent))))
-    # The expert observed at the policy's tick; its stick is for that time.
-    target_ns = stamps(name, ticks, "woke_ns") if "expert" in ticks.column_names else sent_ns
+    # The expert observed at the policy's decision; its stick is for that time.
+    target_ns = tick_ns if "expert" in ticks.column_names else sent_ns
     if contract.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(contract))

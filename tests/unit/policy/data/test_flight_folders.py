@@ -81,19 +81,23 @@ def test_one_of_several_cameras_is_read(tmp_path: Path) -> None:
 def test_a_tick_counts_as_the_decision_behind_it_and_as_no_later_than_the_next(
     tmp_path: Path,
 ) -> None:
-    """Otherwise a history would hold the labels: the state is that of the decision."""
-    folder = flight(
-        tmp_path / "a",
-        woke_ns=[100 * MS, 200 * MS, 210 * MS, 220 * MS],
-        expert=None,
-        sent=[STICK] * 4,
-        captured_ns=[None, 40 * MS, None, 140 * MS],
-        solved_ns=[(None, None), (90 * MS, 40 * MS), (90 * MS, 40 * MS), (215 * MS, 45 * MS)],
-    )
+    """Otherwise a history would hold the labels: the state is that of the decision.
+
+    An expert's stick is for the state it was computed at, not for the later send.
+    """
+    ticks = {
+        "woke_ns": [100 * MS, 200 * MS, 210 * MS, 220 * MS],
+        "sent": [STICK] * 4,
+        "captured_ns": [None, 40 * MS, None, 140 * MS],
+        "solved_ns": [(None, None), (90 * MS, 40 * MS), (90 * MS, 40 * MS), (215 * MS, 45 * MS)],
+    }
+    folder = flight(tmp_path / "a", **ticks, expert=None)
     read = read_flight(folder)
     assert read.tick_ns.tolist() == [50 * MS, 50 * MS, 50 * MS, 170 * MS]
     assert read.age_ns.tolist() == read_ages(folder).tolist() == [10 * MS, 30 * MS]
     assert read.target_ns.tolist() == [100 * MS, 200 * MS, 210 * MS, 220 * MS]
+    labelled = read_flight(flight(tmp_path / "b", **ticks, expert=[STICK] * 4))
+    assert labelled.target_ns.tolist() == read.tick_ns.tolist()
 
 
 def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path) -> None:
