@@ -210,6 +210,15 @@ def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_
     assert held.fault((until_ms + 100) * MS) is None, "the next one that may be flown ends it"
 
 
+def test_gaps_after_chunks_that_end_too_early_add_up_to_100_ms() -> None:
+    held = buffer(50)
+    for serial, now_ms in enumerate(range(1000, 1350, 50), start=1):
+        held.offer(chunk(serial, now_ms, **SHORT), now_ms * MS)
+    over_ns = (now_ms + 35 + 100 - 6 * 15) * MS
+    assert held.fault(over_ns) is None
+    assert held.fault(over_ns + 1) is not None
+
+
 def test_a_chunk_that_comes_just_as_the_last_one_ends_makes_up_for_a_gap_before_that() -> None:
     held = holding(**SHORT)  # until 1035 ms
     held.offer(chunk(2, 1085, **SHORT), 1085 * MS)
