@@ -160,6 +160,11 @@ def test_the_file_beside_the_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
     (data / "mavbridge.toml").write_text("[contract]\nchunk_dt_s = 0.02\n")
     path = draft(checkpoint(tmp_path / "policy"), "--dataset", str(data))
     assert path.read_text() == (data / "mavbridge.toml").read_text()
+    (data / "mavbridge.toml").write_text("[contract\n")
+    policy = checkpoint(tmp_path / "other")
+    status, said = told_by("contract", policy, "--dataset", data)
+    assert (status, (policy / "mavbridge.toml").exists()) == (2, False)
+    assert "mavbridge.toml cannot be copied: Expected ']'" in said
 
 
 def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
