@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -131,11 +131,11 @@ class CountingInClass(TwoRates):
 
 
 class CountingBelow(TwoRates):
-    """Its memory is an object in a list, and an iterator."""
+    """Its memory is an object in a list or deque, and an iterator."""
 
-    def __init__(self) -> None:
+    def __init__(self, phases: Any) -> None:
         super().__init__()
-        self.phases, self.clock = [SimpleNamespace(calls=0)], itertools.count()
+        self.phases, self.clock = phases, itertools.count()
 
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         self.phases[0].calls = next(self.clock)
@@ -145,14 +145,6 @@ class CountingBelow(TwoRates):
 @dataclass(slots=True)
 class Phase:
     calls: int = 0
-
-
-class CountingInSlots(CountingBelow):
-    """Its memory is an object with slots in a deque, and an iterator."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.phases: Any = deque([Phase()])
 
 
 class CountingBy(TwoRates):

@@ -5,7 +5,6 @@ import subprocess
 from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from cyclopts.exceptions import CycloptsError, MissingArgumentError
@@ -87,21 +86,13 @@ def parse_make(arguments: list[str]) -> None:
         assert re.search(found, makefile, re.M), f"make {word}"
 
 
-class Command(NamedTuple):
-    """One command line on a page."""
-
-    words: list[str]
-    is_whole: bool
-    """Of a block; a mention in the text may leave out what is required."""
-
-
-def commands_of(page: Path) -> Iterator[Command]:
-    """Commands of all blocks, then those in the text."""
+def commands_of(page: Path) -> Iterator[tuple[list[str], bool]]:
+    """Yield the words of each command, and True for one of a block: a mention in the text may leave
+    out what is required."""
     for block in blocks(page):
         if block.kind in ("", "sh", "bash", "console"):
-            for words in command_lines(block.text):
-                yield Command(words, is_whole=True)
-    yield from (Command(words, is_whole=False) for words in mentions(page))
+            yield from ((words, True) for words in command_lines(block.text))
+    yield from ((words, False) for words in mentions(page))
 
 
 def mentions(page: Path) -> Iterator[list[str]]:
@@ -122,7 +113,7 @@ def mentions(page: Path) -> Iterator[list[str]]:
 
 
 def test_the_pages_hold_commands_of_both_programs() -> None:
-    commands = [command.words for page in PAGES for command in commands_of(page)]
+    commands = [words for page in PAGES for words, _ in commands_of(page)]
     assert len(commands) > 100
     assert any(words[:3] == ["python", "-m", "sitl"] for words in commands)
     assert any(words[0] == "mavbridge" for words in commands)
@@ -130,13 +121,13 @@ def test_the_pages_hold_commands_of_both_programs() -> None:
 
 @pytest.mark.parametrize("page", [page_name(page) for page in PAGES])
 def test_every_command_on_a_page_parses(page: str) -> None:
-    for command in commands_of(ROOT / page):
+    for words, is_whole in commands_of(ROOT / page):
         try:
-            parse(command.words)
+            parse(words)
         except MissingArgumentError:
-            assert not command.is_whole, f"{page}: {' '.join(command.words)}"
+            assert not is_whole, f"{page}: {' '.join(words)}"
         except (CycloptsError, MavbridgeError, AssertionError, SystemExit) as error:
-            pytest.fail(f"{page}: {' '.join(command.words)}\n{type(error).__name__}: {error}")
+            pytest.fail(f"{page}: {' '.join(words)}\n{type(error).__name__}: {error}")
 
 
 def test_an_unknown_flag_or_command_would_be_found() -> None:

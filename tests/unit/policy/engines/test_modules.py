@@ -3,10 +3,12 @@
 import logging
 import re
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -54,8 +56,10 @@ NO_GRAPHS = [
     *((partial(changed, *each), "it decides by the values of a tensor") for each in DECIDING),
     (torch_policies.Counting, "it keeps calls from call to call"),
     (torch_policies.CountingInClass, "it keeps calls from call to call"),
-    (torch_policies.CountingBelow, "it keeps calls, clock from call to call"),
-    (torch_policies.CountingInSlots, "it keeps calls, clock from call to call"),
+    *(
+        (partial(torch_policies.CountingBelow, phases), "it keeps calls, clock from call to call")
+        for phases in ([SimpleNamespace(calls=0)], deque([torch_policies.Phase()]))
+    ),
     (torch_policies.OnSchedule, "it calls now, which a graph cannot"),
     (torch_policies.ReadingFile, "it calls .*open.*read"),
     (torch_policies.ReadingQueue, "it calls empty, which a graph cannot"),
