@@ -12,6 +12,7 @@ from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.values import Phase
+from mavbridge.mavlink.outputs.sender import LEVELS
 from mavbridge.mavlink.transport.connection import REFUSED_NS
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind
@@ -88,8 +89,9 @@ def test_without_a_receiver_no_takeover_leaves_a_lean_behind() -> None:
     flight.run(0.9)
     assert flight.samples[-1].mode == "STABILIZE"
     assert not flight.modes_asked(before_ns)
-    (roll, pitch, _, yaw), *releases = overrides(flight, given_ns - MS)
-    assert (roll, pitch, yaw) == (1500, 1500, 1500)
+    sent = overrides(flight, given_ns - MS)
+    levels, releases = sent[:LEVELS], sent[LEVELS:]
+    assert {(roll, pitch, yaw) for roll, pitch, _, yaw in levels} == {(1500, 1500, 1500)}
     assert len(releases) > 10
     assert set(releases) == {(0, 0, 0, 0)}
     sticks = [e["us"] for e in flight.summary["sticks"] if e["t_s"] >= given_s + 0.02]

@@ -23,6 +23,8 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import Connection
 
 RELEASE_SPACING_NS = 50 * NS_PER_MS
+LEVELS = 3
+"""Packets of an output's ``last_sticks``: a lossy link may drop some of them."""
 CARRIED: dict[Output, ActionKind] = {
     "rc-override": "sticks",
     "manual-control": "sticks",
@@ -102,10 +104,10 @@ class ActionSender:
         if vehicle is None or output is None:
             return None
         if isinstance(decision, Release):
-            self._level(output, vehicle)
-            output.released()
-            if self._releases_left > 0 and self._clock.now_ns() >= self._release_due_ns:
-                self.try_release()
+            if self._level(output, vehicle):
+                output.released()
+                if self._releases_left > 0:
+                    self.try_release()
             return None
         made_ns = self._clock.now_ns() if decided_ns is None else decided_ns
         encoded = output.encode(decision, vehicle, made_ns)
@@ -147,22 +149,29 @@ class ActionSender:
                     request = vehicle.profile.modes.command(mode)
                     yield after_ns, self._codec.encode_request(vehicle.identity.source, request)
 
-    def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:
-        """Before the first release, send the output's ``last_sticks``, if any."""
-        if self._releases_left < output.releases:
-            return  # not the first release
-        now_ns = self._clock.now_ns()
-        encoded = output.last_sticks(vehicle, now_ns)
-        if encoded is not None and self._connection.send(encoded.packet):
+    def _level(self, output: ActionOutput, vehicle: VehicleSession) -> bool:
+        """Before the releases, send the output's ``last_sticks``; False if they must wait."""
+        now_ns, sent = self._clock.now_ns(), output.releases - self._releases_left
+        is_due = sent < LEVELS and now_ns >= self._release_due_ns
+        encoded = output.last_sticks(vehicle, now_ns) if is_due else None
+        if encoded is None:
+            return True
+        is_sent = self._connection.send(encoded.packet)
+        if is_sent and sent == 0:
             output.sent(encoded, now_ns)
-            self._note_release(is_sent=True)
+        self._note_release(is_sent=is_sent)
+        return is_sent
 
     def try_release(self) -> bool:
-        """Send a release. Return False if it failed and must precede all other packets."""
+        """Send a release that is due. Return False if it failed and must precede all others."""
         vehicle, output = self._vehicle, self.output
         if vehicle is None or output is None:
             return True
-        packet = output.release_packet(vehicle, self._clock.now_ns())
+        if not self._level(output, vehicle):
+            return False
+        if (now_ns := self._clock.now_ns()) < self._release_due_ns:
+            return True
+        packet = output.release_packet(vehicle, now_ns)
         is_sent = packet is None or self._connection.send(packet)
         self._note_release(is_sent=is_sent)
         return is_sent

@@ -256,6 +256,32 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
     assert rig.link.stats().sent_overrides == 41
 
 
+@pytest.mark.parametrize("is_refused", [True, False])
+@pytest.mark.parametrize("dropped", [1, 2])
+def test_level_sticks_precede_a_release_over_a_link_that_drops_some(
+    dropped: int, is_refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a receiver, ArduPilot keeps the last sticks that it heard."""
+    rig = Rig()
+    rig.vehicle.channels = [0] * 8
+    beat = rig.vehicle.end.heartbeat(armed=True)
+    monkeypatch.setattr(rig.vehicle.end, "heartbeat", lambda: beat)
+    rig.ready().run(0.3, Sticks(0.3, 0.0, 0.5, 0.5))
+    count, send = len(rig.overrides()), rig.vehicle.send
+    fates = iter([not is_refused] * dropped)
+
+    def drop(data: bytes, peer: Address | None = None) -> bool:
+        is_override = data[7] == dialect.MAVLINK_MSG_ID_RC_CHANNELS_OVERRIDE
+        fate = next(fates, None) if is_override else None
+        return send(data, peer) if fate is None else fate
+
+    monkeypatch.setattr(rig.vehicle, "send", drop)
+    snapshot = rig.run(0.3, PILOTS)
+    first, *_, last = rig.overrides()[count:]
+    assert (first[:4], last) == ([1500] * 4, RELEASE_US)
+    assert not snapshot.is_released  # the vehicle shows only ours
+
+
 def test_the_report_tells_of_echo_and_clocks() -> None:
     rig = Rig().ready()
     told = rig.link.stats()
