@@ -264,16 +264,6 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
 
 
-@pytest.mark.parametrize("facts", [NO_RECEIVER, altered(PX4, has_receiver=True)])
-def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(facts: Any) -> None:
-    stepped = at_fault(facts)
-    moves = stepped.run(0.2, mode="BRAKE" if facts.status.mode == "ALT_HOLD" else "AUTO.LOITER")
-    assert {move.control for move in moves} == {NEUTRAL}
-    assert stepped.phase is Phase.HOLDING
-    assert {move.control for move in stepped.run(60)} == {NEUTRAL}
-    assert stepped.step(armed=False).control is RELEASE
-
-
 def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     stepped = flying(NO_RECEIVER)
     stepped.engagement.stop(DEATH)

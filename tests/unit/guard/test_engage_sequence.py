@@ -64,18 +64,6 @@ def test_px4_takes_off_through_its_own_modes_and_gets_setpoints_before_offboard(
     assert stepped.phase is Phase.FLYING
 
 
-def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter() -> None:
-    facts = altered(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
-    stepped = Stepped(facts, is_setpoint=True, modes=("OFFBOARD",))
-    stepped.step()
-    flow = [stepped.step("engage"), *stepped.run(0.09)]
-    assert {(move.control, move.mode) for move in flow} == {(NEUTRAL, None)}
-    move = stepped.step()
-    assert (move.control, move.mode) == (NEUTRAL, "OFFBOARD")
-    stepped.step(mode="OFFBOARD")
-    assert stepped.phase is Phase.FLYING
-
-
 # --- single steps, each condition by itself
 
 

@@ -212,19 +212,6 @@ def test_the_duration_counts_from_the_first_engagement_on_and_through_takeovers(
 # --- what is told
 
 
-def test_a_key_on_the_way_in_is_the_whole_reason_and_a_later_act_has_3_s() -> None:
-    stepped = Stepped(altered(ON_GROUND, echo_confirmed=True), arm=True)
-    stepped.run(0.1)
-    stepped.step("release")
-    assert stepped.codes == (Code.OPERATOR,)
-    stepped.run(0.1, is_released=True, armed=True, is_landed=False)
-    stepped.step("engage", is_policy_reset=False)
-    stepped.run(3.0)
-    assert stepped.phase is Phase.PREPARING
-    stepped.step()
-    assert stepped.phase is Phase.RELEASED
-
-
 def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
     stepped = Stepped(altered(ON_GROUND, chunk_problem=because(Code.NO_IMAGE)), arm=True)
     stepped.run(92, is_released=True)

@@ -131,13 +131,6 @@ class Stepped:
 # --- when
 
 
-def test_while_nobody_asks_us_to_fly_slots_pass_and_nothing_is_sent() -> None:
-    guard = Stepped()
-    slots = [guard.step(at_ms, guard.chunk(at_ms)).tick for at_ms in range(0, 100, 5)]
-    assert [tick.index for tick in slots if tick.is_slot] == list(range(10))
-    assert guard.decisions == []
-
-
 def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() -> None:
     guard = Stepped().engaged()
     early = guard.step(33, guard.chunk(33))
@@ -152,31 +145,6 @@ def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() ->
     assert (left_out.decision, left_out.tick.is_slot) == (None, False)
     after = guard.step(60)
     assert (after.tick.index, after.tick.missed_slots) == (6, 0)
-
-
-@pytest.mark.parametrize(
-    ("changes", "act", "expected"),
-    [
-        (
-            {"mode": "LOITER"},
-            None,
-            Release(),
-        ),
-        ({"armed": False}, None, Release()),
-        ({}, "release", NEUTRAL),
-    ],
-)
-def test_a_change_of_hands_does_not_wait_for_a_slot(
-    changes: dict[str, Any], act: OperatorCommand | None, expected: Decision
-) -> None:
-    guard = Stepped().engaged()
-    output = guard.step(31, act=act, **changes)
-    assert (output.decision, output.tick.is_slot) == (expected, False)
-
-
-def test_what_has_not_changed_is_not_sent_between_slots() -> None:
-    guard = Stepped().engaged()
-    assert [guard.step(30 + k).decision for k in range(1, 10)] == [None] * 9
 
 
 def asked_before_the_reset() -> tuple[Stepped, GuardOutput]:
