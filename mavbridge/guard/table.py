@@ -104,20 +104,23 @@ def engage(m: Memory, _: EngagementInputs) -> bool:
     return m.act == "engage"
 
 
+_KEY = EndRequest(because(Code.OPERATOR), end="operator")
+
+
 def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
     """a stop
 
     The key `q`, a signal, a flight process that failed or died, the last gate of `--gates`.
     """
     if m.act == "release" and not m.must_stop:
-        return EndRequest(because(Code.OPERATOR), end="operator")
+        return _KEY
     return m.end_request
 
 
 def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """the key `q`, or the first stop after a fault"""
     if m.act == "release":
-        return EndRequest(because(Code.OPERATOR), end="operator")
+        return _KEY
     request, roles = m.end_request, now.link.modes
     if request is not None and request.is_fault and m.disengage.mode in (roles.land, roles.rtl):
         return None  # a fault must not stop a landing or a return

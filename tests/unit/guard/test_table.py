@@ -545,6 +545,10 @@ def test_rows(name: str) -> None:
             not_engaged(because(Code.NOT_READY, after_s=3, **IN_LOITER, inputs="fine")),
         ),
         ("our mode comes after the release", because(Code.ENTERED_LATE, mode="ALT_HOLD")),
+        (
+            "another mode before ours is there, and armed in it",
+            because(Code.WRONG_MODE, mode="GUIDED", allowed="ALT_HOLD or ALTCTL"),
+        ),
         ("takeover: failsafe", because(Code.FAILSAFE, mode="RTL")),
         ("takeover: switch low", because(Code.ENGAGE_SWITCH_OFF, channel=7)),
         ("takeover: mode_changed", because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")),
