@@ -218,7 +218,7 @@ def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
 
 
 def _ends(ticks: Sequence[Tick], outcome: FlightOutcome | None) -> Iterator[Moment]:
-    """Yield unplanned ends; the death of the guard has no tick of its own."""
+    """Yield unplanned ends, also that by the guard's death, after which there is no tick."""
     if ticks[-1].trace is not None and outcome is not None and outcome.end == "fault":
         yield _end(ticks, ticks[-1], ticks[-1].woke_ns, outcome.reason)
     for last, tick in pairwise(ticks):
