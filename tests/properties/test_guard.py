@@ -184,7 +184,8 @@ class GuardMachine(RuleBasedStateMachine):
     @rule(is_overruled=st.booleans())
     def overrule(self, is_overruled: bool) -> None:
         """The vehicle shows another source's sticks, or ours again."""
-        self.world.overruled = because(Code.OVERRULED) if is_overruled else None
+        reason = because(Code.OVERRULED, quantity="sticks", output="rc-override", fault="foreign")
+        self.world.overruled = reason if is_overruled else None
         self.must_end = is_overruled
         self.step()
 
