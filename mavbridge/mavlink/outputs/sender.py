@@ -23,8 +23,9 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import Connection
 
 RELEASE_SPACING_NS = 50 * NS_PER_MS
-LEVELS = 3
-"""Packets of an output's ``last_sticks``: a lossy link may drop some of them."""
+LEVELS = 2
+"""Packets of an output's ``last_sticks``: the link may lose one. A third would leave later than 100
+ms after a takeover."""
 CARRIED: dict[Output, ActionKind] = {
     "rc-override": "sticks",
     "manual-control": "sticks",

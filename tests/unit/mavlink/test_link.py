@@ -256,8 +256,7 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
     assert rig.link.stats().sent_overrides == 41
 
 
-@pytest.mark.parametrize("is_refused", [True, False])
-@pytest.mark.parametrize("dropped", [1, 2])
+@pytest.mark.parametrize(("dropped", "is_refused"), [(1, True), (2, True), (1, False)])
 def test_level_sticks_precede_a_release_over_a_link_that_drops_some(
     dropped: int, is_refused: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
