@@ -3,14 +3,14 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mavbridge.camera.grabber import Image
-from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES
+from mavbridge.camera.pipe_frames import DamageCount
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.provenance import without_secrets
@@ -41,8 +41,11 @@ class CaptureSource:
     has_driver_stamps: bool = False
     """True on a device. Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as
     CAP_PROP_POS_MSEC (modules/videoio/src/cap_v4l.cpp); other systems return something else."""
-    bad_frames: int = 0
-    """Consecutive frames that could not be decoded: cables damage MJPEG."""
+    damage: DamageCount = field(init=False)
+    """Of frames that could not be decoded: cables damage MJPEG."""
+
+    def __post_init__(self) -> None:
+        self.damage = DamageCount(self.name, "frames")
 
     def next_image(self) -> Image | None:
         """See `ImageSource`."""
@@ -51,13 +54,9 @@ class CaptureSource:
         arrived_ns, stamp_ms = self.clock.now_ns(), 0.0
         if self.has_driver_stamps:
             stamp_ms = self.capture.get(cv2.CAP_PROP_POS_MSEC)
-        if (rgb := retrieve_rgb(self.capture)) is not None:
-            self.bad_frames = 0
-            return Image(arrived_ns, rgb, round(stamp_ms * NS_PER_MS))
-        self.bad_frames += 1
-        if self.bad_frames > MAX_BAD_FRAMES:
-            raise CameraError(f"{self.name}: {self.bad_frames} frames in a row are damaged")
-        return None
+        rgb = retrieve_rgb(self.capture)
+        self.damage.note(rgb)
+        return None if rgb is None else Image(arrived_ns, rgb, round(stamp_ms * NS_PER_MS))
 
     def close(self) -> None:
         """See `ImageSource`."""

@@ -11,7 +11,7 @@ from struct import Struct
 from typing import NamedTuple
 
 from mavbridge.camera.grabber import Image
-from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
+from mavbridge.camera.pipe_frames import MAX_JPEG_BYTES, DamageCount, decode_picture
 from mavbridge.core.address import LOOPBACK, host_port, spelled
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
@@ -133,7 +133,8 @@ class JpegUdpSource:
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
-        self._datagrams = self._bad_frames = 0
+        self._datagrams = 0
+        self._damage = DamageCount(self._name)
         self._silent_after_ns = clock.now_ns() + SILENT_NS
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -154,13 +155,9 @@ class JpegUdpSource:
                 )
             return None
         self._silent_after_ns = self._clock.now_ns() + SILENT_NS
-        if (pixels := decode_picture(frame.picture)) is not None:
-            self._bad_frames = 0
-            return Image(frame.arrived_ns, pixels, frame.key.stamp_ns)
-        self._bad_frames += 1
-        if self._bad_frames > MAX_BAD_FRAMES:
-            raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
-        return None
+        pixels = decode_picture(frame.picture)
+        self._damage.note(pixels)
+        return None if pixels is None else Image(frame.arrived_ns, pixels, frame.key.stamp_ns)
 
     def _newest_frame(self) -> Assembly | None:
         """Drain the socket, which may hold several frames."""

@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import (
-    MAX_BAD_FRAMES,
     MAX_SIDE_PX,
     RAW_FORMATS,
+    DamageCount,
     FrameCutter,
     PictureCutter,
     RawCutter,
@@ -103,7 +103,7 @@ class PipeSource:
         self._clock = clock
         self._cutter = command.cutter()
         self._errors = b""
-        self._bad_frames = 0
+        self._damage = DamageCount(self._name)
         self._silent_after_ns = clock.now_ns() + FIRST_NS
         try:
             self._process = subprocess.Popen(
@@ -138,13 +138,9 @@ class PipeSource:
                 raise CameraError(f"{self._name} is silent{self._last_error()}")
             return None
         frame, first_ns = newest
-        if (rgb := self._cutter.decode(frame)) is not None:
-            self._bad_frames = 0
-            return Image(first_ns, rgb)
-        self._bad_frames += 1
-        if self._bad_frames > MAX_BAD_FRAMES:
-            raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
-        return None
+        rgb = self._cutter.decode(frame)
+        self._damage.note(rgb)
+        return None if rgb is None else Image(first_ns, rgb)
 
     def _read_frames(self) -> None:
         data = os.read(self._out, _READ_BYTES)

@@ -29,6 +29,20 @@ _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 """Marker in a scan's coded data, where 00 and the restart markers D0 to D7 are data."""
 
 
+class DamageCount:
+    """Number of consecutive frames of one source that could not be decoded."""
+
+    def __init__(self, name: str, frames: str = "pictures") -> None:
+        """``name`` is the source's name in messages, ``frames`` that of its frames."""
+        self._name, self._frames, self._count = name, frames, 0
+
+    def note(self, rgb: CameraImage | None) -> None:
+        """Count a frame, None if damaged. Raises CameraError after ``MAX_BAD_FRAMES`` in a row."""
+        self._count = self._count + 1 if rgb is None else 0
+        if self._count > MAX_BAD_FRAMES:
+            raise CameraError(f"{self._name}: {self._count} {self._frames} in a row are damaged")
+
+
 class RawFormat(NamedTuple):
     """Memory layout of a raw picture."""
 
