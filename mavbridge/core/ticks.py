@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mavbridge.core.reasons import Reason
-from mavbridge.core.vehicle import Action, ActionTrace
+from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,3 +39,6 @@ class GuardTick:
     starting_ns: int = 0
     """Time since which only the policy's first chunk is missing: it gets control with the first
     chunk that follows a reset at or after this time; 0: not starting. Not recorded."""
+    end: FlightEnd | None = None
+    """How the policy's last flight ended; None during a flight and before the first. Not
+    recorded."""

@@ -22,7 +22,6 @@ from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.stopping import HungError, StopRequest, Worker, stop_on_signals
-from mavbridge.core.vehicle import FlightEnd
 from mavbridge.flight.checks import check_flight, output_folders, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess, start_guard
@@ -144,7 +143,7 @@ class _Flight:
         self._stack = stack
         self._guard = guard
         self._has_hung = False
-        self._ending = EndRequest(reason=because(Code.GUARD_DIED), is_fault=True)
+        self._ending = EndRequest(reason=because(Code.GUARD_DIED), end="fault")
         """Reason for which the guard was asked to end. Until it is asked, it ends without a summary
         only if it dies."""
         self._hang_ns = max(
@@ -201,16 +200,9 @@ class _Flight:
     @property
     def _outcome(self) -> FlightOutcome | None:
         """Outcome of the policy's flight; None if the policy never flew."""
-        if not self._observers.referee.has_flown:
-            return None
-        summary, asked, referee = self._guard.summary, self._ending, self._observers.referee
-        end: FlightEnd = "fault" if asked.is_fault else asked.end
-        if summary is not None:
-            end = summary.outcome.end or end
-        elif referee.reason not in (None, asked.reason):  # the guard died after the flight
-            end = referee.end
-        status, is_current = self._view.status, summary is not None
-        return referee.outcome(end, status, asked.reason, is_current=is_current)
+        is_current = self._guard.summary is not None
+        referee, status = self._observers.referee, self._view.status
+        return referee.outcome(self._ending, status, is_current=is_current)
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""
@@ -240,7 +232,7 @@ class _Flight:
         released = 0
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
-                ending = EndRequest(reason=fault, is_fault=True)
+                ending = EndRequest(fault, "fault")
                 break
             if (over := referee.ending(self._clock.now_ns())) is not None:
                 ending = over

@@ -9,7 +9,7 @@ from pathlib import Path
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, CourseProgress
 from mavbridge.core.errors import ExitCode
-from mavbridge.core.reasons import Code, Kind, Reason, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
@@ -38,17 +38,6 @@ _ENDS: dict[FlightEnd, str] = {
     "fault": "a fault",
 }
 _UNPLANNED = ("takeover", "disarmed", "fault")
-_END_BY_REASON: dict[Code, FlightEnd] = {
-    Code.COURSE_DONE: "course",
-    Code.POLICY_STOPPED: "stopped",
-    Code.DURATION: "duration",
-    Code.LANDED: "landed",
-    Code.OPERATOR: "operator",
-    Code.SIGNAL: "signal",
-    Code.DISARMED: "disarmed",
-    **dict.fromkeys((Code.FAILSAFE, Code.REBOOTED, Code.REPLACED), "takeover"),
-}
-"""Ends by reason. Other reasons: a takeover if they are the pilot's, else a fault."""
 
 
 class Standstill:
@@ -90,8 +79,8 @@ class FlightReferee:
         self._flown: Tick | None = None
         """Last tick in which the policy had control."""
         self._has_position = self._is_flying = False
-        self.reason: Reason | None = None
-        """Why the policy's last flight ended; None while it flies."""
+        self._ended: EndRequest | None = None
+        """How the policy's last flight ended, as the guard has told it; None while it flies."""
 
     def emit(self, event: Event) -> None:
         """Follow the ticks from the policy's first action on."""
@@ -102,26 +91,13 @@ class FlightReferee:
         was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING
         if self._is_flying:
             self._began_ns = self._began_ns or event.sent_ns
-            self._flown, self.reason = event, None
+            self._flown, self._ended = event, None
             self._has_position = self._has_position or event.position_ned_m is not None
-        elif was_flying:
-            self.reason = event.release_reason
+        elif was_flying and event.release_reason is not None and event.end is not None:
+            self._ended = EndRequest(event.release_reason, event.end)
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
             self._crashes.see(event)
-
-    @property
-    def has_flown(self) -> bool:
-        """True if the policy has had control."""
-        return self._flown is not None
-
-    @property
-    def end(self) -> FlightEnd:
-        """Kind of end of the policy's last flight, by its reason alone."""
-        if self.reason is None:
-            return "fault"
-        other: FlightEnd = "takeover" if self.reason.kind is Kind.PILOT else "fault"
-        return _END_BY_REASON.get(self.reason.code, other)
 
     @property
     def crash(self) -> str | None:
@@ -136,32 +112,27 @@ class FlightReferee:
         standstill = self._standstill
         has_stopped = standstill is not None and standstill.has_lasted(now_ns)
         if not self._course.is_done:
-            stopped = EndRequest(reason=because(Code.POLICY_STOPPED), end="stopped")
-            return stopped if has_stopped else None
+            return EndRequest(because(Code.POLICY_STOPPED), "stopped") if has_stopped else None
         run_out_ns = RUN_OUT_NS if standstill is None else MAX_RUN_OUT_NS
         is_over = has_stopped or now_ns - self._course.passed_ns[-1] >= run_out_ns
-        return EndRequest(reason=because(Code.COURSE_DONE), end="course") if is_over else None
+        return EndRequest(because(Code.COURSE_DONE), "course") if is_over else None
 
     def outcome(
-        self,
-        end: FlightEnd,
-        vehicle: GuardStatus,
-        asked: Reason | None = None,
-        *,
-        is_current: bool = True,
+        self, asked: EndRequest, vehicle: GuardStatus, *, is_current: bool = True
     ) -> FlightOutcome | None:
-        """Return the outcome of a flight that ended by ``end``; None if the policy has not flown.
+        """Return the outcome of the flight; None if the policy has not flown.
 
-        ``asked``: reason for the end, if the guard died before it could tell one;
-        ``is_current``: the guard has reported ``vehicle`` until its own end.
+        ``asked``: the end, if the guard died before it could tell one; ``is_current``: the guard
+        has reported ``vehicle`` until its own end.
         """
         if (flown := self._flown) is None:
             return None
+        reason, end = self._ended or asked
         position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
             end=end,
-            reason=self.reason or asked,
+            reason=reason,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
             speed_mps=None if state is None else state.speed_mps,
@@ -228,7 +199,7 @@ def flight_verdict(
     if summary is None:
         return interrupted or ExitCode.NOT_FLOWN, None
     outcome = summary.outcome
-    if outcome.faults:
+    if outcome.fault is not None:
         shown = f"; see it with: mavbridge inspect {shlex.quote(str(record))}" if record else ""
         fault = f"the policy's flight was ended by a fault: {outcome.fault}{shown}"
         return ExitCode.FAULT, fault
@@ -242,7 +213,7 @@ def flight_verdict(
     if outcome.has_left_ground is False:
         code = interrupted or ExitCode.NOT_FLOWN
         return code, "the vehicle has not left the ground"
-    if outcome.is_disarmed:
+    if outcome.end == "disarmed":
         text = "the vehicle was disarmed, or restarted, while the policy flew it"
         return ExitCode.NOT_FLOWN, text
     return ExitCode.DONE, None

@@ -243,7 +243,7 @@ class Engagement(Memory):
         twin = deepcopy(self, {id(self.settings): self.settings})
         twin.disengage.ask_at_once(now.now_ns)
         if self.phase in (Phase.PREPARING, Phase.FLYING):
-            twin.stop(EndRequest(because(Code.GUARD_DIED), is_fault=True))
+            twin.stop(EndRequest(because(Code.GUARD_DIED), end="fault"))
         # Sticks jump to neutral unseen; the flight process sends the words at once, or never.
         link = replace(now.link, are_sticks_at_rest=False)
         status = replace(now.status, mode_arrived_ns=None)

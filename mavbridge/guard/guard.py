@@ -170,6 +170,7 @@ class Guard:
             phase=phase,
             release_reason=self.engagement.reason,
             starting_ns=self.engagement.starting_ns or 0,
+            end=self.engagement.outcome.end,
         )
         return GuardOutput(
             decision=decision, actions=actions, messages=self._take_messages(), tick=tick

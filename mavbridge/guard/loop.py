@@ -342,7 +342,7 @@ class GuardLoop:
             except ValueError:
                 if self._phase not in _TAKEN:
                     raise  # nobody is held, and the bug is told with its traceback
-                self.stop(EndRequest(reason=because(Code.UNREADABLE), is_fault=True))
+                self.stop(EndRequest(reason=because(Code.UNREADABLE), end="fault"))
                 continue
             match message:
                 case Chunk() as chunk:
@@ -364,7 +364,7 @@ class GuardLoop:
                 case _:
                     pass  # settings are taken only once
         if self._flight.is_closed:
-            self.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+            self.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), end="fault"))
         return GuardInput(
             link=snapshot,
             chunk=chunk,

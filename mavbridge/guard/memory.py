@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
-from mavbridge.core.vehicle import FlightEnd
 from mavbridge.guard.sequences import DisengageSequence, EngageSequence
 from mavbridge.guard.values import (
     EndRequest,
@@ -153,8 +152,7 @@ class Memory:
 
     def fly(self, now: EngagementInputs, _cause: object) -> None:
         """the policy's actions, starting from the pilot's or idle sticks"""
-        flights = self.outcome.flights + 1
-        self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
+        self.outcome = self.outcome._replace(flights=self.outcome.flights + 1, end=None)
         self.reason, self.own_mode, self.seen_interruptions = (
             None,
             now.status.mode,
@@ -174,7 +172,7 @@ class Memory:
         self.must_stop = self.must_stop and cause != self.end_request
         if cause.end == "takeover":
             self.seen_interruptions = now.link.interruptions
-        self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal
+        self.refusal = self.disengage.begin(now, is_planned=cause.is_planned) or self.refusal
         # PX4 ignores the transmitter's own switches until its receiver follows our sticks.
         has_fallback = bool(now.link.modes.override) and not self.disengage.is_silence_failsafe
         has_switch = self.settings.engage_channel is not None and not self.switch.is_off
@@ -218,14 +216,10 @@ class Memory:
         self.released_mode = now.status.mode if is_ours else None
 
     def _note_end(self, cause: EndRequest) -> None:
-        """Note how a flight has ended, and count it if a fault of ours ended it."""
-        if self.phase is not Phase.FLYING:
-            return
-        is_fault = cause.is_fault and cause.end not in ("takeover", "disarmed")
-        end: FlightEnd = "fault" if is_fault else cause.end
-        self.outcome = self.outcome._replace(end=end, is_disarmed=end == "disarmed")
-        if is_fault:
-            self.outcome = self.outcome._replace(faults=self.outcome.faults + 1, fault=cause.reason)
+        """Note how a flight has ended."""
+        if self.phase is Phase.FLYING:
+            fault = cause.reason if cause.end == "fault" else self.outcome.fault
+            self.outcome = self.outcome._replace(end=cause.end, fault=fault)
 
 
 def not_engaged(why: Reason) -> Reason:

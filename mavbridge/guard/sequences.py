@@ -227,7 +227,7 @@ class DisengageSequence:
         """Request the mode at the next step, without waiting for the spacing."""
         self.request_due_ns, self.asks_until_ns = now_ns, now_ns + MODE_TIMEOUT_NS
 
-    def begin(self, now: EngagementInputs, *, is_fault: bool) -> Reason | None:
+    def begin(self, now: EngagementInputs, *, is_planned: bool) -> Reason | None:
         """Choose the safe mode. Return why a release that the flag demands is refused, or None."""
         self.ask_at_once(now.now_ns)
         self.began_ns = now.now_ns
@@ -237,15 +237,15 @@ class DisengageSequence:
         self.is_silence_failsafe = (
             now.status.has_receiver is not True or now.link.modes.is_silence_failsafe
         )
-        choice, note = self.settings.on_fault if is_fault else self.settings.then, None
+        choice, note = self.settings.then if is_planned else self.settings.on_fault, None
         objection = self._hand_objection(now)
         self.may_release = objection is None
         if choice in ("auto", "release"):
-            instead: OnFault = "hold" if is_fault else "land"
+            instead: OnFault = "land" if is_planned else "hold"
             if objection is not None and choice == "release":
                 note = because(Code.NOT_RELEASED, instead=instead, why=objection)
             # Centred sticks would let a vehicle drift that its policy has stopped.
-            is_kept = choice == "auto" and self.settings.keeps_place and not is_fault
+            is_kept = choice == "auto" and self.settings.keeps_place and is_planned
             released: OnFault = "hold" if is_kept else "release"
             choice = released if objection is None else instead
         # A pilot's sticks would do nothing in a setpoint mode or during the autopilot's takeoff.

@@ -122,9 +122,10 @@ def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
     if m.act == "release":
         return _KEY
     request, roles = m.end_request, now.link.modes
-    if request is not None and request.is_fault and m.disengage.mode in (roles.land, roles.rtl):
+    comes_down = m.disengage.mode in (roles.land, roles.rtl)
+    if request is None or not m.must_stop or (comes_down and request.end == "fault"):
         return None  # a fault must not stop a landing or a return
-    return request if m.must_stop else None
+    return request
 
 
 def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
@@ -138,7 +139,7 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """
     if (reason := _takeover(m, now)) is None:
         return None
-    return EndRequest(reason, is_fault=True, end="takeover" if now.status.armed else "disarmed")
+    return EndRequest(reason, "takeover" if now.status.armed else "disarmed")
 
 
 def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
@@ -163,7 +164,7 @@ def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
             is_echoed=now.link.echo_confirmed,
             inputs=now.chunk_problem or "fine",
         )
-    return EndRequest(not_engaged(problem) if m.is_act else problem, is_fault=True)
+    return EndRequest(not_engaged(problem) if m.is_act else problem, "fault")
 
 
 def duration_over(m: Memory, now: EngagementInputs) -> EndRequest | None:
@@ -190,7 +191,7 @@ def fault(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """
     problem = now.link.problem or now.chunk_fault or now.envelope_problem
     reason = problem or _failsafe(m, now, keeps_mode=True) or switch_unseen(m, now)
-    return None if reason is None else EndRequest(reason, is_fault=True)
+    return None if reason is None else EndRequest(reason, "fault")
 
 
 def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:

@@ -46,10 +46,13 @@ class EndRequest(NamedTuple):
     """Request to end a flight, with its reason."""
 
     reason: Reason
-    is_fault: bool = False
     end: FlightEnd = "signal"
-    """How the flight ends; "fault" is recorded with ``is_fault``, unless this is "takeover" or
-    "disarmed"."""
+    """How the flight ends."""
+
+    @property
+    def is_planned(self) -> bool:
+        """True if ``--then`` follows, not ``--on-fault``."""
+        return self.end not in ("takeover", "disarmed", "fault")
 
 
 class Outcome(NamedTuple):
@@ -59,14 +62,10 @@ class Outcome(NamedTuple):
     """Number of times that the policy took control."""
     has_left_ground: bool | None = None
     """True if the vehicle left the ground in any flight; None: it does not report it."""
-    faults: int = 0
-    """Number of flights ended by a fault of ours."""
-    is_disarmed: bool = False
-    """True if the last flight ended by disarming, by the vehicle itself or by a person."""
     end: FlightEnd | None = None
     """How the last flight ended; None before that."""
     fault: Reason | None = None
-    """Newest fault of ours."""
+    """Newest fault of ours that has ended a flight; None: none has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -109,7 +109,7 @@ ON_GROUND = altered(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, i
 NO_RECEIVER = altered(AIRBORNE, has_receiver=False, pilot_sticks=None)
 IDLE_RECEIVER = altered(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
-DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
+DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), end="fault")
 
 
 def stick_smoothing(

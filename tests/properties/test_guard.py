@@ -297,7 +297,7 @@ class GuardMachine(RuleBasedStateMachine):
         code = {"dies": Code.FLIGHT_PROCESS_DIED, "ends": Code.SIGNAL, "fails": Code.POLICY_FAILED}[
             how
         ]
-        self.world.stop = EndRequest(reason=because(code), is_fault=how != "ends")
+        self.world.stop = EndRequest(because(code), "signal" if how == "ends" else "fault")
         if how == "dies":
             self.world.has_chunks = False
             self.silent_ns = self.silent_ns or self.world.now_ns

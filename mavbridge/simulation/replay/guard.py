@@ -250,7 +250,7 @@ def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
     if reason is not None and reason.code is Code.THEN:
         reason = dict(reason.data)["first"]  # type: ignore[assignment]
     if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
-        return EndRequest(reason=reason, is_fault=reason.kind is Kind.FAULT)
+        return EndRequest(reason, "fault" if reason.kind is Kind.FAULT else "signal")
     if tick.phase == Phase.ENDED != was:  # the second of two stops has no effect
         return EndRequest(reason=because(Code.SIGNAL))
     return None

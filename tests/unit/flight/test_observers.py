@@ -11,6 +11,7 @@ from rich.console import Console
 
 from helpers.factories import make_tick
 from helpers.fakes import FakeClock
+from helpers.guard_facts import DEATH
 from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.plan import plan_flight
@@ -47,7 +48,7 @@ def test_a_flight_that_flew_is_reported_although_the_vehicle_is_gone(tmp_path: P
     watching = observers(report := tmp_path / "report.json", io.StringIO())
     watching.referee.emit(make_tick(0, phase="flying"))
     gone = GuardStatus("ArduPilot", None, False, None, (), None)
-    watching.finish(None, None, watching.referee.outcome("fault", gone))
+    watching.finish(None, None, watching.referee.outcome(DEATH, gone))
     assert report.exists()
 
 

@@ -23,11 +23,12 @@ from mavbridge.flight.outcome import (
     describe,
     flight_verdict,
 )
-from mavbridge.guard.values import Outcome
+from mavbridge.guard.values import EndRequest, Outcome
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)
 NO_CHUNK = because(Code.NO_CHUNK)
+FAULT = because(Code.POLICY_FAILED)
 HIT = "it hit gate 7"
 STATS = LinkStats(
     messages_per_s=(),
@@ -62,9 +63,9 @@ def stopped(number: int | None) -> StopRequest:
         (FLOWN, None, None, 0, None),
         (FLOWN, signal.SIGINT, None, 0, None),  # Ctrl-C is how a flight without a duration ends
         (FLOWN._replace(has_left_ground=None), None, None, 0, None),  # the vehicle does not tell
-        (FLOWN._replace(faults=1), None, None, 4, "a fault"),
-        (FLOWN._replace(flights=3, faults=1), signal.SIGINT, None, 4, "a fault"),
-        (FLOWN._replace(is_disarmed=True), None, None, 3, "was disarmed"),
+        (FLOWN._replace(fault=FAULT), None, None, 4, "a fault"),
+        (FLOWN._replace(flights=3, fault=FAULT), signal.SIGINT, None, 4, "a fault"),
+        (FLOWN._replace(end="disarmed"), None, None, 3, "was disarmed"),
         (FLOWN._replace(has_left_ground=False), None, None, 3, "not left the ground"),
         (FLOWN._replace(has_left_ground=False), signal.SIGTERM, None, 143, "not left the ground"),
         (Outcome(), None, None, 3, f"the policy has not flown: {NO_CHUNK}"),
@@ -73,8 +74,8 @@ def stopped(number: int | None) -> StopRequest:
         (None, None, None, 3, None),
         (FLOWN, None, HIT, 6, HIT),
         (FLOWN, signal.SIGINT, HIT, 6, HIT),
-        (FLOWN._replace(is_disarmed=True), None, HIT, 6, HIT),
-        (FLOWN._replace(faults=1), None, HIT, 4, ""),  # a fault comes first
+        (FLOWN._replace(end="disarmed"), None, HIT, 6, HIT),
+        (FLOWN._replace(fault=FAULT), None, HIT, 4, ""),  # a fault comes first
         (None, None, HIT, 3, None),
     ],
 )
@@ -93,7 +94,7 @@ def test_the_status_says_what_a_script_needs(
 @pytest.mark.parametrize("record", [None, Path("flights/a b")])
 def test_a_fault_is_told_with_its_cause_and_the_command_that_shows_it(record: Path | None) -> None:
     old = because(Code.TOO_OLD, quantity="attitude", age_ms=104.0, limit_ms=100.0)
-    words = summary(FLOWN._replace(faults=1, fault=old))
+    words = summary(FLOWN._replace(fault=old))
     _, told = flight_verdict(words, stopped(None), reason=None, readonly=False, record=record)
     end = "" if record is None else "; see it with: mavbridge inspect 'flights/a b'"
     assert (told or "").endswith(f": {old}{end}")
@@ -108,6 +109,7 @@ def test_a_flight_that_sends_nothing_needs_no_air() -> None:
 
 GATES = [CourseGate(Position(north, 0.0, -2.0), 0.0, 2.4) for north in (4.0, 8.0)]
 HOVERING = GuardStatus("ardupilot", "LOITER", True, False, (), None)
+DEATH = EndRequest(because(Code.GUARD_DIED), "fault")
 
 
 def course_ticks(count: int, **changes: Any) -> list[Tick]:
@@ -131,7 +133,7 @@ def judged(
     referee = FlightReferee(gates)
     for tick in ticks:
         referee.emit(tick)
-    outcome = referee.outcome(end, HOVERING)
+    outcome = referee.outcome(EndRequest(FAULT, end), HOVERING)
     assert outcome is not None
     return outcome
 
@@ -140,7 +142,9 @@ def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     referee, ticks = FlightReferee(GATES), course_ticks(300)
     over = [tick.index for tick in ticks if referee.emit(tick) or referee.ending(tick.sent_ns)]
     assert over[0] == 80 + RUN_OUT_NS // 10_000_000
-    outcome = referee.outcome("course", HOVERING)
+    ending = referee.ending(ticks[-1].sent_ns)
+    assert ending == EndRequest(because(Code.COURSE_DONE), "course")
+    outcome = referee.outcome(ending, HOVERING)
     assert outcome is not None
     assert (outcome.gates_passed, outcome.gates_total, outcome.success) == (2, 2, True)
     assert outcome.course_s == pytest.approx(0.8)
@@ -190,40 +194,22 @@ def test_without_guards_a_flight_is_told_by_its_end() -> None:
     told = "ended by --duration after 2.0 s, at 2.0 m, 10.0 m/s, now armed in LOITER"
     assert describe(outcome) == told
     assert FlightReferee(None).ending(10**18) is None
-    assert FlightReferee(GATES).outcome("signal", HOVERING) is None, "nobody has flown"
+    assert FlightReferee(GATES).outcome(DEATH, HOVERING) is None, "nobody has flown"
 
 
-def test_a_second_flight_has_a_reason_of_its_own() -> None:
-    taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
-    first = [*course_ticks(50), make_released_tick(51, taken, phase="released")]
+def test_each_flight_ends_as_the_guard_tells_and_by_its_death_before() -> None:
+    taken = EndRequest(because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), "takeover")
+    later = make_released_tick(52, because(Code.THEN, first=taken.reason, then=NO_CHUNK))
+    first = [*course_ticks(50), make_released_tick(51, taken.reason, end="takeover"), later]
     referee = FlightReferee(None)
-    for ticks, end in ((first, "takeover"), (course_ticks(50), "fault")):
+    for ticks, (reason, end) in ((first, taken), (course_ticks(50), DEATH)):
         for tick in ticks:
             referee.emit(tick)
-        assert referee.end == end
-    outcome = referee.outcome("fault", HOVERING, because(Code.GUARD_DIED), is_current=False)
-    assert outcome is not None
-    assert outcome.reason == because(Code.GUARD_DIED)
+        outcome = referee.outcome(DEATH, HOVERING, is_current=False)
+        assert outcome is not None
+        assert (outcome.reason, outcome.end) == (reason, end)
     assert describe(outcome).endswith("last seen armed in LOITER: the guard has died")
     assert "last seen armed in an unknown mode: " in describe(replace(outcome, mode=None))
-
-
-@pytest.mark.parametrize(
-    ("code", "end"),
-    [
-        *((code, code.value) for code in (Code.OPERATOR, Code.DURATION, Code.LANDED, Code.SIGNAL)),
-        *((Code.COURSE_DONE, "course"), (Code.POLICY_STOPPED, "stopped")),
-        *((Code.DISARMED, "disarmed"), (Code.OVERRIDE_SWITCH_OFF, "takeover")),
-        *((code, "takeover") for code in (Code.FAILSAFE, Code.REBOOTED, Code.REPLACED)),
-        *((Code.POLICY_FAILED, "fault"), (Code.CONNECTION_LOST, "fault")),
-        *((Code.CLOCK_SET_BACK, "fault"), (Code.MOVED, "fault")),  # as the guard counts them
-    ],
-)
-def test_without_a_summary_the_reason_tells_the_end(code: Code, end: FlightEnd) -> None:
-    referee = FlightReferee(None)
-    for tick in (*course_ticks(50), make_released_tick(51, because(code), phase="leaving")):
-        referee.emit(tick)
-    assert referee.end == end
 
 
 def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:

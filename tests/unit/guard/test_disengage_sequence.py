@@ -21,7 +21,7 @@ from helpers.guard_facts import (
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
-from mavbridge.core.vehicle import ModeRoles
+from mavbridge.core.vehicle import FlightEnd, ModeRoles
 from mavbridge.guard.sequences import DisengageSequence
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
@@ -212,7 +212,7 @@ def test_a_refused_mode_becomes_land() -> None:
     assert {move.mode for move in late} == {None}, "it has come all the same"
     sequence, refused = DisengageSequence(engagement_settings()), {"refused_mode": "BRAKE"}
     for _ in range(2):
-        sequence.begin(altered(IDLE_RECEIVER, **refused), is_fault=True)
+        sequence.begin(altered(IDLE_RECEIVER, **refused), is_planned=False)
         move = sequence.step(altered(IDLE_RECEIVER, **refused), None)
         assert move.mode == "BRAKE", "an earlier flight's refusal is over"
 
@@ -235,7 +235,8 @@ def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
 ) -> None:
     sticks = None if throttle is None else CENTRED._replace(throttle=throttle)
     stepped = flying(altered(AIRBORNE, pilot_sticks=sticks), **settings)
-    stepped.engagement.stop(EndRequest(reason=because(Code.DURATION), is_fault=is_fault))
+    end: FlightEnd = "fault" if is_fault else "duration"
+    stepped.engagement.stop(EndRequest(because(Code.DURATION), end))
     mode = stepped.step().mode
     assert mode == ("BRAKE" if is_fault else "LAND")
     why = because(Code.THROTTLE_UNKNOWN)
@@ -501,7 +502,7 @@ def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
 def test_a_command_that_failed_delays_only_its_own_way_out() -> None:
     sequence, asked = DisengageSequence(engagement_settings()), []
     for command_failed in (True, False):
-        sequence.begin(PX4, is_fault=True)
+        sequence.begin(PX4, is_planned=False)
         facts = altered(PX4, now_ns=PX4.now_ns + NS_PER_MS, command_failed=command_failed)
         asked.append(sequence.step(facts, None).mode)
     assert asked == [None, "AUTO.LOITER"]

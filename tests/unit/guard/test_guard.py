@@ -348,7 +348,7 @@ def test_a_vehicle_is_heard_by_its_newest_message_and_asked_for_a_mode_as_long(
     old = {"mode_arrived_ns": START_NS, "channels_arrived_ns": START_NS}
     guard = Stepped(status={"has_receiver": False, **old})
     guard.telemetry = heard(0)
-    guard.engaged().step(31, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+    guard.engaged().step(31, stop=EndRequest(reason=because(Code.GUARD_DIED), end="fault"))
     for at_ms in range(40, 1000, 10):
         if fresh == "attitude":
             guard.telemetry = heard(at_ms)
@@ -364,7 +364,7 @@ def test_where_neutral_may_not_have_been_sent_px4_is_not_asked_for_a_mode_at_onc
 ) -> None:
     status = {"mode": "ALTCTL", "has_receiver": False}
     guard = Stepped(roles=PX4_MODES, modes=("ALTCTL",), status=status).engaged()
-    guard.step(40, fault=fault, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+    guard.step(40, fault=fault, stop=EndRequest(reason=because(Code.GUARD_DIED), end="fault"))
     asked_ms = [at_ms for at_ms in range(50, 1050, 10) if guard.step(at_ms).actions.mode]
     assert asked_ms[0] == (50 if fault is None else 1040)
 
@@ -378,7 +378,7 @@ def test_which_acts_end_neutral_sticks() -> None:
         rules = {"modes": ("ALTCTL",), "engage_channel": channel}
         guard = Stepped(roles=roles, status=status, **rules).engaged()
         assert guard.guard.ways_out == "you disarm or change the mode by a ground station"
-        guard.step(40, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True))
+        guard.step(40, stop=EndRequest(reason=because(Code.GUARD_DIED), end="fault"))
         assert ("or put the engage switch low" in guard.guard.ways_out) == (channel == 7)
     for at_ms in range(50, 1200, 10):
         guard.step(at_ms, rc_channels_us=())
@@ -389,7 +389,7 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     guard = Stepped().engaged()
     for at_ms in range(40, 740, 10):
         guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
-    assert guard.guard.engagement.outcome.faults == 1
+    assert guard.guard.engagement.outcome.end == "fault"
     assert because(Code.BATTERY) in [o.tick.release_reason for o in guard.outputs]
 
 

@@ -260,7 +260,7 @@ def test_sticks_leave_before_requests_and_other_work() -> None:
 
 def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
     rig = Rig(has_receiver=False).flying()
-    rig.tell(EndRequest(reason=because(Code.POLICY_FAILED), is_fault=True))
+    rig.tell(EndRequest(reason=because(Code.POLICY_FAILED), end="fault"))
     rig.run(0.5)
     assert rig.ticks[-1].phase is Phase.HOLDING
     assert rig.link.is_engaged
@@ -302,7 +302,7 @@ def test_a_mode_that_cannot_be_asked_for_does_not_end_the_guard() -> None:
         raise UserError(f"no mode {mode}")
 
     rig.link.set_mode = refuse  # type: ignore[method-assign]
-    rig.loop.stop(EndRequest(reason=because(Code.DURATION), is_fault=True))
+    rig.loop.stop(EndRequest(reason=because(Code.DURATION), end="fault"))
     rig.run(6.0)
     assert rig.link.decisions[-1][1] == NEUTRAL  # over an idle receiver
     assert rig.ticks[-1].phase is Phase.HOLDING
