@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import NS_PER_MS, Clock, period_ns
@@ -25,6 +26,7 @@ MAX_AHEAD_NS = 20 * NS_PER_MS
 """Tolerance for exposure stamps in the future, which would hide that much of the image's age."""
 
 
+@dataclass(slots=True, kw_only=True)
 class VisionLoop:
     """Encodes frames as they arrive, at most at the visual rate, and publishes the features.
 
@@ -32,61 +34,46 @@ class VisionLoop:
     skipped; a quarter of a period is tolerated for camera jitter.
     """
 
-    def __init__(
-        self,
-        *,
-        camera: Camera,
-        encode: Callable[[CameraImage, int], FloatArray],
-        cache: FeatureCache,
-        sink: TickSink,
-        clock: Clock,
-        period_ns: int,
-        encoder_lock: threading.Lock,
-        image_watch: ImageWatch | None = None,
-        is_airborne: Callable[[], bool] = lambda: False,
-        number: int = 0,
-    ) -> None:
-        """Join a camera, an encoder and a cache; nothing runs yet.
+    camera: Camera
+    """Read by this loop alone."""
+    encode: Callable[[CameraImage, int], FloatArray]
+    """Image of a camera to its feature."""
+    cache: FeatureCache
+    """Gets every feature, with the fault of its image, and every refusal of the policy."""
+    sink: TickSink
+    """Gets a tick for every encoded or refused image."""
+    clock: Clock
+    """Time of the start and end of the encoding."""
+    period_ns: int
+    """Shortest time between two encoded frames."""
+    encoder_lock: threading.Lock
+    """Held while encoding; loops that share a policy share it, because no policy has to be ready
+    for two threads."""
+    image_watch: ImageWatch | None = None
+    """Judges each encoded frame; None where the policy looks at no image, or the renderer draws
+    none."""
+    is_airborne: Callable[[], bool] = lambda: False
+    """Whether the vehicle is known to be in the air; a frozen image is a fault only then. Called
+    from this loop's thread."""
+    number: int = 0
+    """Place of the camera in the contract."""
+    alive_ns: int = field(init=False)
+    """End of the last step; read by another thread."""
+    encoding_since_ns: int | None = field(default=None, init=False)
+    """Start of the encoding in progress; None while waiting for the lock. Read by another
+    thread."""
+    _used_ns: int | None = field(default=None, init=False)
+    """Slot of the last used frame."""
+    _frames: int = field(default=0, init=False)
 
-        Args:
-            camera: read by this loop alone.
-            encode: image of a camera to its feature.
-            cache: gets every feature, with the fault of its image, and every refusal of the policy.
-            sink: gets a tick for every encoded or refused image.
-            clock: time of the start and end of the encoding.
-            period_ns: shortest time between two encoded frames.
-            encoder_lock: held while encoding; loops that share a policy share it, because no
-                policy has to be ready for two threads.
-            image_watch: judges each encoded frame; None where the policy looks at no image, or the
-                renderer draws none.
-            is_airborne: whether the vehicle is known to be in the air; a frozen image is a fault
-                only then. Called from this loop's thread.
-            number: place of the camera in the contract.
-        """
-        self._camera = camera
-        self._number = number
-        self._encoder_lock = encoder_lock
-        self._encode = encode
-        self._cache = cache
-        self._sink = sink
-        self._clock = clock
-        self._period_ns = period_ns
-        self._image_watch = image_watch
-        self._is_airborne = is_airborne
-        self._used_ns: int | None = None
-        """Slot of the last used frame."""
-        self._frames = 0
-        self.alive_ns = clock.now_ns()
-        """End of the last step; read by another thread."""
-        self.encoding_since_ns: int | None = None
-        """Start of the encoding in progress; None while waiting for the lock. Read by another
-        thread."""
+    def __post_init__(self) -> None:
+        self.alive_ns = self.clock.now_ns()
 
     def run(self, stop: threading.Event) -> None:
         """Encode until ``stop`` is set; raise CameraError if the camera has died."""
         while not stop.is_set():
             self.step()
-            self.alive_ns = self._clock.now_ns()
+            self.alive_ns = self.clock.now_ns()
 
     def step(self) -> None:
         """Wait up to ``READ_TIMEOUT_NS`` for one frame; encode and publish it.
@@ -94,31 +81,31 @@ class VisionLoop:
         An image for which the policy raises NoChunkError is shown and recorded, but has no feature.
         Raise CameraError as ``run``.
         """
-        frame = self._camera.read(READ_TIMEOUT_NS)
-        started_ns = self._clock.now_ns()
+        frame = self.camera.read(READ_TIMEOUT_NS)
+        started_ns = self.clock.now_ns()
         if frame is None:
             return
         captured_ns = min(frame.captured_ns, started_ns)
         if not self._is_due(captured_ns):
             return
         fault: Reason | None = None
-        if self._image_watch is not None:
-            is_airborne = self._is_airborne()
-            fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
+        if self.image_watch is not None:
+            is_airborne = self.is_airborne()
+            fault = self.image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
         ahead_ns = frame.captured_ns - started_ns
         if ahead_ns > MAX_AHEAD_NS:
             ahead_ms, limit_ms = ahead_ns / NS_PER_MS, MAX_AHEAD_NS / NS_PER_MS
             fault = because(Code.IMAGE_AHEAD, ahead_ms=ahead_ms, limit_ms=limit_ms)
         value: FloatArray | None = None
-        with self._encoder_lock:
-            self.encoding_since_ns = self._clock.now_ns()
+        with self.encoder_lock:
+            self.encoding_since_ns = self.clock.now_ns()
             try:
-                value = self._encode(frame.rgb, self._number)
+                value = self.encode(frame.rgb, self.number)
             except NoChunkError as error:  # the last feature ages, up to its limit
-                self._cache.refusal = fault = because(Code.POLICY_REFUSED, said=str(error))
+                self.cache.refusal = fault = because(Code.POLICY_REFUSED, said=str(error))
             finally:
                 self.encoding_since_ns = None
-        ready_ns = self._clock.now_ns()
+        ready_ns = self.clock.now_ns()
         if value is not None:
             value.setflags(write=False)
             feature = FeatureFrame(
@@ -128,17 +115,17 @@ class VisionLoop:
                 value=value,
                 fault=fault,
             )
-            self._cache.publish(feature)
-        self._sink.emit(
+            self.cache.publish(feature)
+        self.sink.emit(
             VisionTick(
                 serial=self._frames,
                 frame_id=frame.frame_id,
                 captured_ns=captured_ns,
                 started_ns=started_ns,
                 ready_ns=ready_ns,
-                dropped_frames=self._camera.dropped_frames,
+                dropped_frames=self.camera.dropped_frames,
                 rgb=frame.rgb,
-                camera=self._number,
+                camera=self.number,
                 feature=value,
                 fault=fault,
             )
@@ -149,11 +136,11 @@ class VisionLoop:
         if self._used_ns is None:
             self._used_ns = captured_ns
             return True
-        due_ns = self._used_ns + self._period_ns
-        if captured_ns < due_ns - self._period_ns // 4:
+        due_ns = self._used_ns + self.period_ns
+        if captured_ns < due_ns - self.period_ns // 4:
             return False
         # Keep the grid through jitter; after a gap start a new one.
-        self._used_ns = max(due_ns, captured_ns - self._period_ns // 2)
+        self._used_ns = max(due_ns, captured_ns - self.period_ns // 2)
         return True
 
 
