@@ -19,7 +19,7 @@ from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
 from mavbridge.core.observers import FanOut
 from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle_thread
-from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.stopping import HungError, StopRequest, Worker, stop_on_signals
 from mavbridge.flight.checks import check_flight, output_folders, signing_note
@@ -33,7 +33,7 @@ from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.speed import require_speed
 from mavbridge.flight.state import observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
-from mavbridge.flight.vision_loop import vision_loops
+from mavbridge.flight.vision_loop import VisionLoop, vision_loops
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import patient_console
@@ -125,6 +125,65 @@ def fly_policy(
                 flight.finish()
 
 
+class _Watchdog:
+    """Finds a loop that has ended or hangs, so that no more chunks will come."""
+
+    def __init__(
+        self, plan: FlightPlan, clock: Clock, policy: PolicyLoop, visions: Sequence[VisionLoop]
+    ) -> None:
+        self._clock = clock
+        self._policy = policy
+        self._visions = dict(zip(plan.contract.cameras, visions, strict=True))
+        self._policy_hang_ns = max(
+            LEAST_HANG_NS,
+            HANG_PERIODS * plan.guard.chunk_period_ns,
+            plan.guard.freshness.state_ns,  # of a slow policy that plays each chunk for long
+        )
+        self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * plan.start_limits.feature_ns)
+        self._looked_ns = self._resumed_ns = clock.now_ns()
+        self.has_hung = False
+
+    @property
+    def patience_s(self) -> float:
+        """Time that one call of the policy may last before it counts as hung; 0 once it has."""
+        longest_ns = max(self._policy_hang_ns, self._encoder_hang_ns)
+        return 0.0 if self.has_hung else longest_ns / NS_PER_S
+
+    def fault(self, policy: Worker, visions: Sequence[Worker]) -> EndRequest | None:
+        """Return the end of the flight if no more chunks will come, or None."""
+        for camera, vision in zip(self._visions, visions, strict=True):
+            if not vision.is_alive:
+                failed = because(Code.CAMERA_FAILED, camera=self._named(camera))
+                return EndRequest(failed, "fault")
+        if not policy.is_alive:
+            return EndRequest(because(Code.POLICY_FAILED), "fault")
+        now_ns = self._clock.now_ns()
+        if now_ns - self._looked_ns > STOPPED_NS:
+            self._resumed_ns = now_ns
+        self._looked_ns = now_ns
+        # Encoders wait for one another: the one that computes is the one that hangs.
+        camera, _ = min(
+            self._visions.items(),
+            key=lambda encoder: (encoder[1].encoding_since_ns or now_ns, encoder[1].alive_ns),
+        )
+        silent_ns = min(vision.alive_ns for vision in self._visions.values())
+        encoder = f"encoder{self._named(camera, 'of camera ')}"
+        for alive_ns, name, limit_ns in (
+            (self._policy.alive_ns, "policy", self._policy_hang_ns),
+            (silent_ns, encoder, self._encoder_hang_ns),
+        ):
+            idle_ns = now_ns - max(alive_ns, self._resumed_ns)
+            if idle_ns > limit_ns:
+                self.has_hung = True
+                hangs = because(Code.HANGS, name=name, idle_s=idle_ns / NS_PER_S)
+                return EndRequest(hangs, "fault")
+        return None
+
+    def _named(self, camera: str, prefix: str = "") -> str:
+        """Return the camera's name for a message; empty if it is the only camera."""
+        return f" {prefix}{camera}" if len(self._visions) > 1 else ""
+
+
 class _Flight:
     """State of one flight. Every resource is pushed on the exit stack when it is opened."""
 
@@ -138,42 +197,30 @@ class _Flight:
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
-        config = self._config = plan.config
+        self._config, self._cameras = plan.config, plan.contract.cameras
         self._clock = clock
         self._stack = stack
         self._guard = guard
-        self._has_hung = False
         self._ending = EndRequest(reason=because(Code.GUARD_DIED), end="fault")
         """Reason for which the guard was asked to end. Until it is asked, it ends without a summary
         only if it dies."""
-        self._hang_ns = max(
-            LEAST_HANG_NS,
-            HANG_PERIODS * plan.guard.chunk_period_ns,
-            plan.guard.freshness.state_ns,  # of a slow policy that plays each chunk for long
-        )
-        feature_ns = plan.start_limits.feature_ns
-        self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
-        self._looked_ns = self._resumed_ns = clock.now_ns()
         self._observers = FlightObservers(plan, runner, clock=clock, console=console)
         stack.callback(self._close_recorder)  # after the guard: it records the release
-        contract = runner.contract
-        self._cameras = contract.cameras
-        past_ns = observation_ages_ns(contract)[0]
         cameras = open_cameras(
-            config.camera,
-            contract,
-            image_size=least_source_px(contract),
+            plan.config.camera,
+            plan.contract,
+            image_size=least_source_px(plan.contract),
             clock=clock,
             report=lambda line: console.print(Text(line)),
             stack=stack,
         )
-        caches = [FeatureCache(span_ns=past_ns) for _ in cameras]
         self._observers.open_viewer(stack)
         self._observers.open_recorder(guard, lambda: self._view.status.autopilot)
-        sink = FanOut((*self._observers.sinks, *sinks))
+        recorders, sink = self._observers.recorders, FanOut((*self._observers.sinks, *sinks))
         self._view = TelemetryCache(
             plan, sink=sink, samples=guard.samples, watch_packets=self._observers.watch_packets
         )
+        caches = [FeatureCache(span_ns=observation_ages_ns(plan.contract)[0]) for _ in cameras]
         self._visions = vision_loops(
             plan,
             self._view,
@@ -181,8 +228,8 @@ class _Flight:
             cameras=cameras,
             caches=caches,
             clocks=[clock] * len(cameras),
-            sinks=[sink, *[FanOut(self._observers.recorders)] * (len(cameras) - 1)],
-            watches_images=looks_at_images(config),
+            sinks=[sink, *[FanOut(recorders)] * (len(cameras) - 1)],
+            watches_images=looks_at_images(plan.config),
         )
         self._policy = PolicyLoop(
             plan,
@@ -191,11 +238,12 @@ class _Flight:
             view=self._view,
             caches=caches,
             send=guard.send,
-            watches=[each.emit for each in self._observers.recorders],
+            watches=[each.emit for each in recorders],
         )
+        self._watchdog = _Watchdog(plan, clock, self._policy, self._visions)
 
     def _close_recorder(self) -> None:
-        self._observers.close_recorder(self._outcome)
+        self._observers.close_recorder(self._guard.summary, self._outcome)
 
     @property
     def _outcome(self) -> FlightOutcome | None:
@@ -207,12 +255,9 @@ class _Flight:
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""
         view, screen = self._view, self._observers.screen
+        names = ("mavbridge-vision", *(f"mavbridge-vision-{name}" for name in self._cameras[1:]))
         visions = [
-            Worker(
-                "mavbridge-vision" if number == 0 else f"mavbridge-vision-{self._cameras[number]}",
-                vision.run,
-            )
-            for number, vision in enumerate(self._visions)
+            Worker(name, vision.run) for name, vision in zip(names, self._visions, strict=True)
         ]
         policy = Worker("mavbridge-policy", self._scheduled(self._policy.run))
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
@@ -231,11 +276,8 @@ class _Flight:
         has_act = has_keys or self._config.engage_channel is not None
         released = 0
         while listener.is_alive and not stop.is_set():
-            if (fault := self._fault(visions, policy)) is not None:
-                ending = EndRequest(fault, "fault")
-                break
-            if (over := referee.ending(self._clock.now_ns())) is not None:
-                ending = over
+            ending = self._watchdog.fault(policy, visions) or referee.ending(self._clock.now_ns())
+            if ending is not None:
                 break
             stop.wait(1 / STATUS_HZ)
             released = released + 1 if view.phase is Phase.RELEASED else 0
@@ -282,39 +324,6 @@ class _Flight:
             self._observers.screen.show_message(text)
         return exit_code
 
-    def _fault(self, visions: Sequence[Worker], policy: Worker) -> Reason | None:
-        """Return why no more chunks will come, or None."""
-        for vision, camera in zip(visions, self._cameras, strict=True):
-            if not vision.is_alive:
-                return because(Code.CAMERA_FAILED, camera=self._named(camera))
-        if not policy.is_alive:
-            return because(Code.POLICY_FAILED)
-        now_ns = self._clock.now_ns()
-        if now_ns - self._looked_ns > STOPPED_NS:
-            self._resumed_ns = now_ns
-        self._looked_ns = now_ns
-        # Encoders wait for one another: the one that computes is the one that hangs.
-        camera, _ = min(
-            zip(self._cameras, self._visions, strict=True),
-            key=lambda encoder: (encoder[1].encoding_since_ns or now_ns, encoder[1].alive_ns),
-        )
-        silent_ns = min(vision.alive_ns for vision in self._visions)
-        encoder = f"encoder{self._named(camera, 'of camera ')}"
-        watched = (
-            (self._policy.alive_ns, "policy", self._hang_ns),
-            (silent_ns, encoder, self._encoder_hang_ns),
-        )
-        for alive_ns, name, limit_ns in watched:
-            idle_ns = now_ns - max(alive_ns, self._resumed_ns)
-            if idle_ns > limit_ns:
-                self._has_hung = True
-                return because(Code.HANGS, name=name, idle_s=idle_ns / NS_PER_S)
-        return None
-
-    def _named(self, camera: str, prefix: str = "") -> str:
-        """Return the camera's name for a message; empty if it is the only camera."""
-        return f" {prefix}{camera}" if len(self._cameras) > 1 else ""
-
     def _end(self, ending: EndRequest, listener: Worker, stop: StopRequest) -> None:
         """Ask the guard to end, and wait while it holds the vehicle."""
         self._ending = ending
@@ -333,16 +342,15 @@ class _Flight:
                 screen.show_message(f"after Ctrl-C {holder} sends neutral sticks alone")
             if stop.requests > asked or self._clock.now_ns() > until_ns:
                 break
-        if self._has_hung:
+        if self._watchdog.has_hung:
             raise PeerError(f"{ending.reason}: it is too slow for this computer, or stuck")
 
     def _join(self, worker: Worker) -> None:
         """Join a loop, for as long as one call of the policy may last before it counts as hung."""
-        longest_s = 0.0 if self._has_hung else max(self._hang_ns, self._encoder_hang_ns) / NS_PER_S
         try:
-            worker.join(max(JOIN_S, longest_s))
+            worker.join(max(JOIN_S, self._watchdog.patience_s))
         except HungError:
-            if not self._has_hung:  # else that is being reported already
+            if not self._watchdog.has_hung:  # else that is being reported already
                 raise
 
     def finish(self) -> None:

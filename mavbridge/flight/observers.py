@@ -117,7 +117,6 @@ class FlightObservers:
         self.referee = FlightReferee(self._gates, stops=plan.contract.stops_at_end)
         self._viewer: ObserverThread | None = None
         self._recorder: Recorder | None = None
-        self._guard: GuardProcess | None = None
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
@@ -160,7 +159,7 @@ class FlightObservers:
             plan=self._plan.figures(),
             policy_files=digests(policy_files(self._config.policy)),
         )
-        self._guard, recorder = guard, Recorder(cameras=len(meta.contract.cameras))
+        recorder = Recorder(cameras=len(meta.contract.cameras))
         try:
             recorder.begin(
                 self._config.record,
@@ -175,9 +174,9 @@ class FlightObservers:
             raise UserError(f"--record {self._config.record}: {error}") from error
         self._recorder = recorder
 
-    def close_recorder(self, outcome: FlightOutcome | None) -> None:
+    def close_recorder(self, summary: GuardSummary | None, outcome: FlightOutcome | None) -> None:
         """Finish the recording. Call after the guard has ended, so that it has the release."""
-        recorder, summary = self._recorder, self._guard.summary if self._guard else None
+        recorder = self._recorder
         if recorder is None or self._config.record is None:
             return
         meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
