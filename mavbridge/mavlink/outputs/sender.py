@@ -69,7 +69,8 @@ class ActionSender:
         """Meaning of the policy's actions, and the requested output; None: no policy is loaded."""
         self._vehicle: VehicleSession | None = None
         self._releases_left = self._release_due_ns = 0
-        """Number of releases that may still follow the last action, and time of the next one."""
+        """Number of packets of a release that may still follow the last action, and time of the
+        next one."""
         self.is_release_owed = False
         """True if a release could not be sent: call ``try_release`` before everything else."""
         self.output: ActionOutput | None = None
@@ -105,10 +106,7 @@ class ActionSender:
         if vehicle is None or output is None:
             return None
         if isinstance(decision, Release):
-            if self._level(output, vehicle):
-                output.released()
-                if self._releases_left > 0:
-                    self.try_release()
+            self.try_release()
             return None
         made_ns = self._clock.now_ns() if decided_ns is None else decided_ns
         encoded = output.encode(decision, vehicle, made_ns)
@@ -133,15 +131,15 @@ class ActionSender:
         there fails in the flight, too, and must not end the guard here.
         """
         vehicle, output, now_ns = self._vehicle, copy(self.output), self._clock.now_ns()
-        if vehicle is None:
+        if vehicle is None or output is None:
             return
         with self._codec.rehearsing():
             for after_ns, decision, mode in plan:
                 packet = None
                 with suppress(Exception):
-                    if isinstance(decision, Release) and output is not None:
+                    if isinstance(decision, Release):
                         packet = output.release_packet(vehicle, now_ns)
-                    elif not isinstance(decision, Release | None) and output is not None:
+                    elif decision is not None:
                         encoded = output.encode(decision, vehicle, now_ns)
                         packet = None if encoded is None else encoded.packet
                 if packet is not None:
@@ -150,38 +148,30 @@ class ActionSender:
                     request = vehicle.profile.modes.command(mode)
                     yield after_ns, self._codec.encode_request(vehicle.identity.source, request)
 
-    def _level(self, output: ActionOutput, vehicle: VehicleSession) -> bool:
-        """Before the releases, send the output's ``last_sticks``; False if they must wait."""
-        now_ns, sent = self._clock.now_ns(), output.releases - self._releases_left
-        is_due = sent < LEVELS and now_ns >= self._release_due_ns
-        encoded = output.last_sticks(vehicle, now_ns) if is_due else None
-        if encoded is None:
-            return True
-        is_sent = self._connection.send(encoded.packet)
-        if is_sent and sent == 0:
-            output.sent(encoded, now_ns)
-        self._note_release(is_sent=is_sent)
-        return is_sent
-
     def try_release(self) -> bool:
-        """Send a release that is due. Return False if it failed and must precede all others."""
-        vehicle, output = self._vehicle, self.output
+        """Send the packet of a release that is due, the output's ``last_sticks`` first.
+
+        Return False if it failed and must precede all others.
+        """
+        vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
         if vehicle is None or output is None:
             return True
-        if not self._level(output, vehicle):
-            return False
-        if (now_ns := self._clock.now_ns()) < self._release_due_ns:
+        if self._releases_left == 0 or now_ns < self._release_due_ns:
+            output.released()
             return True
-        packet = output.release_packet(vehicle, now_ns)
+        sent = output.releases - self._releases_left
+        level = output.last_sticks(vehicle, now_ns) if sent < LEVELS else None
+        packet = output.release_packet(vehicle, now_ns) if level is None else level.packet
         is_sent = packet is None or self._connection.send(packet)
-        self._note_release(is_sent=is_sent)
-        return is_sent
-
-    def _note_release(self, *, is_sent: bool) -> None:
+        if level is not None and is_sent and sent == 0:
+            output.sent(level, now_ns)
+        if level is None or is_sent:
+            output.released()
         self.is_release_owed = not is_sent
         if is_sent:
             self._releases_left -= 1
             self._release_due_ns = self._clock.now_ns() + RELEASE_SPACING_NS
+        return is_sent
 
     def transmit(self, data: bytes) -> bool:
         """Send another packet, after an outstanding release. Return False if it was not sent."""
