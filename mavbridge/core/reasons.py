@@ -11,6 +11,8 @@ from functools import partial
 from itertools import chain
 from typing import Any, Self, TypeAlias
 
+from mavbridge.core.clock import NS_PER_MS
+
 Value: TypeAlias = "str | int | float | bool | Reason"
 
 
@@ -274,7 +276,7 @@ class Code(StrEnum):
 
 
 _WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.OF_CAMERA)
-_CAUSES = {
+_CAUSES: dict[tuple[object, object], str] = {
     ("rc-override", "unseen"): "another station may be overriding them, or the receiver has "
     "priority",
     ("rc-override", "foreign"): "another station is overriding them (a joystick on our system id?)",
@@ -292,9 +294,8 @@ _CAUSES = {
     ("setpoints", "silent"): "its target has not changed for 0.4 s while ours has",
     ("sticks", "silent"): "its sticks have not moved for 0.4 s while ours have",
 }
-_CAUSE_OF = ("output", "quantity")
-"""Likely causes of ``OVERRULED`` and ``UNHEARD``, by one of these figures and ``fault``."""
-_SPENT = {
+"""Likely causes of ``OVERRULED`` and ``UNHEARD``, by ``output`` or ``quantity``, and ``fault``."""
+_SPENT: dict[object, str] = {
     "computer": "the computer stood still for",
     "guard": "the guard stood still for",
     "flight process": "the flight process stood still, or solved, for",
@@ -314,18 +315,20 @@ class Reason:
     data: tuple[tuple[str, Value], ...] = ()
 
     @property
+    def inner(self) -> list["Reason"]:
+        """Reasons inside this one, in order."""
+        return [value for _, value in self.data if isinstance(value, Reason)]
+
+    @property
     def kind(self) -> Kind:
         """Party responsible; that of the inner reason if this one only adds words."""
-        inner = dict(self.data).get("first") or dict(self.data).get("why")
-        if self.code in _WRAPPERS and isinstance(inner, Reason):
-            return inner.kind
-        return self.code.kind
+        inner = self.inner
+        return inner[0].kind if self.code in _WRAPPERS and inner else self.code.kind
 
     @property
     def codes(self) -> tuple[Code, ...]:
         """Code of this reason and of those inside it."""
-        inner = [value.codes for _, value in self.data if isinstance(value, Reason)]
-        return (self.code, *chain.from_iterable(inner))
+        return (self.code, *chain.from_iterable(each.codes for each in self.inner))
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -345,21 +348,25 @@ class Reason:
         }
         text = self.code.sentence.format(**words)
         if self.code in (Code.OVERRULED, Code.UNHEARD):
-            keys = ((str(words.get(name)), str(words.get("fault"))) for name in _CAUSE_OF)
+            keys = [(words.get(name), words.get("fault")) for name in ("output", "quantity")]
             return ": ".join((text, *(_CAUSES[key] for key in keys if key in _CAUSES)))
-        if self.code not in (Code.LATE, Code.PAST_HORIZON):
-            return text
-        said, place = words.get("said"), words["place"]
-        if said is not None and place == "flight process":  # it answers, so it does not stall
-            return f"{said}; {text}"
-        spent = _SPENT[str(place)].format(**words)
-        text = f"{text}: {spent} {words['spent_ms']:.0f} ms"
-        return text if said is None else f"{said}; {text}"
+        if self.code in (Code.LATE, Code.PAST_HORIZON):
+            said, place = words.get("said"), words["place"]
+            if said is None or place != "flight process":  # one that answers does not stall
+                text = f"{text}: {_SPENT[place].format(**words)} {words['spent_ms']:.0f} ms"
+            return text if said is None else f"{said}; {text}"
+        return text
 
 
 def because(code: Code, **data: Value) -> Reason:
     """Return the reason with this code and these figures."""
     return Reason(code, tuple(data.items()))
+
+
+def too_old(quantity: str, age_ns: int, limit_ns: int) -> Reason:
+    """Return the reason not to act on an input of this age."""
+    figures = {"age_ms": age_ns / NS_PER_MS, "limit_ms": limit_ns / NS_PER_MS}
+    return because(Code.TOO_OLD, quantity=quantity, **figures)
 
 
 def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, object]:

@@ -157,6 +157,11 @@ class Telemetry(NamedTuple):
     """One number; requested only if the policy takes it."""
 
     @property
+    def motion(self) -> tuple[Reading | None, ...]:
+        """Attitude, body rate, velocity and specific force."""
+        return self[:4]
+
+    @property
     def attitude_ns(self) -> int:
         """Arrival of the newest attitude; 0 before the first."""
         attitude = self.ned_from_body_wxyz

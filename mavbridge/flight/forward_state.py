@@ -23,8 +23,7 @@ def rolled_forward(
 
     ``flown_at`` returns the action that the vehicle flies at a time [ns]: sent already, or planned.
     """
-    attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
-    velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
+    attitude, rate, velocity, force = telemetry.motion
     if attitude is None or rate is None or velocity is None or force is None:
         return telemetry
     now_ns = attitude.happened_ns

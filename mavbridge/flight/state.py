@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.reasons import Code, Reason, because, too_old
 from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.feature_cache import FeatureCache
@@ -80,17 +80,14 @@ class StateReader:
 
         A missing or stale reading is a reason, never a zero.
         """
-        attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
-        velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
-        attitude_limit_ns, velocity_limit_ns = self._limits.state_ns, self._limits.velocity_ns
-        if attitude is None or not attitude.is_fresh(now_ns, attitude_limit_ns):
-            return stale(attitude, "attitude", now_ns, attitude_limit_ns)
-        if rate is None or not rate.is_fresh(now_ns, attitude_limit_ns):
-            return stale(rate, "body rate", now_ns, attitude_limit_ns)
-        if velocity is None or not velocity.is_fresh(now_ns, velocity_limit_ns):
-            return stale(velocity, "velocity", now_ns, velocity_limit_ns)
-        if force is None or not force.is_fresh(now_ns, velocity_limit_ns):
-            return stale(force, "acceleration", now_ns, velocity_limit_ns)
+        limits, readings = self._limits, list[Reading]()
+        limits_ns = (limits.state_ns, limits.state_ns, limits.velocity_ns, limits.velocity_ns)
+        names = ("attitude", "body rate", "velocity", "acceleration")
+        for reading, quantity, limit_ns in zip(telemetry.motion, names, limits_ns, strict=True):
+            if reading is None or not reading.is_fresh(now_ns, limit_ns):
+                return stale(reading, quantity, now_ns, limit_ns)
+            readings.append(reading)
+        attitude, rate, velocity, force = readings
         row = (*velocity.values, *attitude.values, *rate.values, *force.values)
         if self._frame == "enu_flu":
             row = other_frame(row)
@@ -118,19 +115,15 @@ class StateReader:
         for extra in self._extras:
             reading = telemetry.height_above_home_m if extra == "height" else position
             if reading is None or not reading.is_fresh(now_ns, self._limits.velocity_ns):
-                return self._missing(extra, reading, now_ns)
+                if reading is None:
+                    return because(Code.NO_TRUSTED_READING, quantity=_READINGS[extra])
+                return stale(reading, _READINGS[extra], now_ns, self._limits.velocity_ns)
             stamps_ns.append(reading.happened_ns)
             if extra == "goal":
                 numbers += self._to_goal(reading.values)
             else:
                 numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
-
-    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Reason:
-        what = _READINGS[extra]
-        if reading is None:
-            return because(Code.NO_TRUSTED_READING, quantity=what)
-        return stale(reading, what, now_ns, self._limits.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
         """Return the vector from the vehicle to the goal, in the contract's world frame."""
@@ -148,8 +141,7 @@ def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) ->
     if reading.delay_ns < 0:
         ahead_ms = -reading.delay_ns / NS_PER_MS
         return because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms)
-    age_ms, limit_ms = (now_ns - reading.happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
-    return because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms)
+    return too_old(quantity, now_ns - reading.happened_ns, limit_ns)
 
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
@@ -235,10 +227,8 @@ class ObservationSource:
             feature = cache.latest()
             if feature is None:
                 return self._missing(camera, cache.refusal or because(Code.NO_IMAGE))
-            if now_ns - feature.captured_ns > self._max_age_ns:
-                age_ms = (now_ns - feature.captured_ns) / NS_PER_MS
-                limit_ms = self._max_age_ns / NS_PER_MS
-                old = because(Code.TOO_OLD, quantity="image", age_ms=age_ms, limit_ms=limit_ms)
+            if (age_ns := now_ns - feature.captured_ns) > self._max_age_ns:
+                old = too_old("image", age_ns, self._max_age_ns)
                 return self._missing(camera, cache.refusal or old)
             if feature.fault is not None:
                 return self._missing(camera, feature.fault)

@@ -208,14 +208,13 @@ def _absences(source: ReplaySource, period_ns: int) -> Iterator[tuple[int, Reaso
         reason, at_ns = tick.release_reason, tick.decided_ns or tick.woke_ns
         if before.phase != "flying" or tick.phase == "flying" or reason is None:
             continue
-        data = dict(reason.data)
-        why, said = data.get("why"), data.get("said")
-        if reason.code is Code.UNUSABLE_CHUNKS and isinstance(why, Reason):
-            yield from ((at_ns - left, why) for left in reversed(range(MAX_REFUSED)))
+        said = next(iter(reason.inner), None)
+        if reason.code is Code.UNUSABLE_CHUNKS and said is not None:
+            yield from ((at_ns - left, said) for left in reversed(range(MAX_REFUSED)))
         elif reason.code in (Code.LATE, Code.PAST_HORIZON):
             if any(serial < each.serial and each.computed_ns < at_ns for each in source.solves):
                 said = said or because(Code.NO_CHUNK)  # they were too old
-            if isinstance(said, Reason):
+            if said is not None:
                 yield max(taken_ns + 1, at_ns - 1 - shortening_ns), said
                 if not tick.is_slot:  # the last of them caused this pass
                     yield at_ns, said
@@ -248,8 +247,8 @@ def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
     was = None if before is None else before.phase
     reason = tick.release_reason
     if reason is not None and reason.code is Code.THEN:
-        reason = dict(reason.data)["first"]  # type: ignore[assignment]
-    if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
+        reason = reason.inner[0]
+    if tick.phase != was and reason is not None and reason.code in _OWN_ENDINGS:
         return EndRequest(reason, "fault" if reason.kind is Kind.FAULT else "signal")
     if tick.phase == Phase.ENDED != was:  # the second of two stops has no effect
         return EndRequest(reason=because(Code.SIGNAL))

@@ -215,8 +215,4 @@ class _News:
 
 def _stamps_ns(now: Telemetry) -> list[int]:
     """Return the stamps of attitude, rate, velocity and specific force; 0 if missing."""
-    readings = (
-        *(now.ned_from_body_wxyz, now.rate_body_radps),
-        *(now.velocity_ned_mps, now.specific_force_body_mps2),
-    )
-    return [0 if reading is None else reading.happened_ns for reading in readings]
+    return [0 if reading is None else reading.happened_ns for reading in now.motion]
