@@ -50,7 +50,7 @@ HANG_PERIODS = 5
 STOPPED_NS = LEAST_HANG_NS // 2
 """The main thread checks STATUS_HZ times a second. A longer gap means that the whole process was
 stopped, not that the policy hangs."""
-END_S = 10.0
+END_NS = 10 * NS_PER_S
 """Longest wait for a guard that neither holds sticks nor ends."""
 
 
@@ -117,7 +117,7 @@ def fly_policy(
                 flight.run(stop)
             return flight.verdict(stop)
         except MavbridgeError as error:
-            if flight is not None and flight.has_flown:
+            if flight is not None and flight.outcome is not None:
                 error.exit_code = ExitCode.FAULT
             raise
         finally:
@@ -243,10 +243,10 @@ class _Flight:
         self._watchdog = _Watchdog(plan, clock, self._policy, self._visions)
 
     def _close_recorder(self) -> None:
-        self._observers.close_recorder(self._guard.summary, self._outcome)
+        self._observers.close_recorder(self._guard.summary, self.outcome)
 
     @property
-    def _outcome(self) -> FlightOutcome | None:
+    def outcome(self) -> FlightOutcome | None:
         """Outcome of the policy's flight; None if the policy never flew."""
         is_current = self._guard.summary is not None
         referee, status = self._observers.referee, self._view.status
@@ -305,11 +305,6 @@ class _Flight:
 
         return run_settled
 
-    @property
-    def has_flown(self) -> bool:
-        """True if the policy has had control."""
-        return bool(self._view.flights)
-
     def verdict(self, stop: StopRequest) -> int:
         """Return the exit status of the ended flight, and tell the user why it is not 0."""
         exit_code, text = flight_verdict(
@@ -330,12 +325,12 @@ class _Flight:
         self._guard.send(ending)
         screen, view = self._observers.screen, self._view
         asked = stop.requests
-        until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
+        until_ns = self._clock.now_ns() + END_NS
         is_told = False
         while not listener.ends_within(1 / STATUS_HZ):
             is_holding = view.phase is Phase.HOLDING
             if is_holding:  # the guard's release and its summary come after the landing
-                until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
+                until_ns = self._clock.now_ns() + END_NS
             if is_holding and not is_told:
                 is_told = True
                 holder = f"the guard (process {self._guard.pid})"
@@ -356,9 +351,10 @@ class _Flight:
     def finish(self) -> None:
         """Print the report of a flight with a vehicle, and write it to --report."""
         view, screen, summary = self._view, self._observers.screen, self._guard.summary
+        outcome = self.outcome
         for text in view.take_texts():  # said after the last tick
             screen.show_message(text)
-        if view.status.armed and not view.status.is_landed and view.flights:
+        if outcome is not None and outcome.is_armed and not outcome.is_landed:
             height = "" if view.height_m is None else f" at {view.height_m:.0f} m"
             left = f"still armed in {view.status.mode or 'an unknown mode'}{height}"
             if summary is not None:
@@ -374,4 +370,4 @@ class _Flight:
                 "too busy to read them"
             )
         autopilot = view.status.autopilot if view.is_found else None
-        self._observers.finish(self._guard.summary, autopilot, self._outcome)
+        self._observers.finish(summary, autopilot, outcome)

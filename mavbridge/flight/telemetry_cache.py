@@ -89,8 +89,6 @@ class TelemetryCache:
         self.reason: Reason | None = None
         self.starting_ns = 0
         """Time from which the policy is to be reset for a flight; 0: no reset is due."""
-        self.flights = 0
-        """Number of times that the policy took control."""
 
     # --- the reader's side
 
@@ -177,9 +175,7 @@ class TelemetryCache:
             if self._samples is not None and not self._is_awaited:
                 for data in self._samples.receive():  # a slow policy leaves them to us
                     self._receive_samples(decode_samples(data))
-        before, self.phase, self.reason = self.phase, Phase(tick.phase), tick.release_reason
-        if self.phase is Phase.FLYING and before is not Phase.FLYING:
-            self.flights += 1
+        self.phase, self.reason = Phase(tick.phase), tick.release_reason
         self.starting_ns = tick.starting_ns
         joined = self._join(tick)
         if not joined.is_refused:  # else the vehicle still flies the last action

@@ -138,9 +138,8 @@ def test_history_follows_what_was_sent() -> None:
     assert viewed.view.history.resample(at_ns + 10 * MS)[0, 1].tolist() == [0.0] * 4
 
 
-def test_flights_are_counted_and_the_phase_is_that_of_the_guard() -> None:
+def test_the_phase_is_that_of_the_guard() -> None:
     viewed = Viewed().receive(NOBODY, TICK, TICK, replace(NOBODY, phase=Phase.RELEASED), TICK)
-    assert viewed.view.flights == 2
     assert viewed.view.phase is Phase.FLYING
     viewed.receive(replace(NOBODY, phase=Phase.RELEASING, release_reason=OFF))
     assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, OFF)
