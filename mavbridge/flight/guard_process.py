@@ -21,6 +21,7 @@ from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
+    NO_WORDS,
     FromGuard,
     GuardDiedError,
     GuardSummary,
@@ -67,7 +68,7 @@ class GuardProcess:
         self._port = SocketPort(ours, takes_files=True)
         self.samples = SocketPort(samples)
         """The vehicle's readings, for a ``TelemetryCache``."""
-        self._words: LastWords | None = None
+        self._words = NO_WORDS
         self._outlet: int | None = None
         """Duplicate of the guard's socket or port while it holds the vehicle."""
         self._newest: GuardTick | None = None
@@ -148,8 +149,8 @@ class GuardProcess:
             if stands_still:
                 by = f", killed after {SILENT_WAITS * LISTEN_S:g} s in which it stood still"
             raise GuardDiedError(f"the guard process has died{by}: {left}")
-        if self.summary is not None and self.summary.failure is not None:
-            raise PeerError(str(self.summary.failure))
+        if self.summary is not None and self.summary.outcome.failure is not None:
+            raise PeerError(str(self.summary.outcome.failure))
 
     def _stands_still(self, stop: threading.Event, view: TelemetryCache) -> bool:
         """Pass messages on; return True once a guard that holds the vehicle sends none any more.
@@ -169,9 +170,8 @@ class GuardProcess:
     def _holds_vehicle(self) -> bool:
         """True if the last words, but for their age, could be sent, were the guard dead."""
         newest, words = self._newest, self._words
-        if newest is None or words is None or not words.packets:
-            return False
-        return newest.phase in (words.phase, *_STILL_OURS)
+        is_held = newest is not None and newest.phase in (words.phase, *_STILL_OURS)
+        return is_held and bool(words.packets)
 
     def _too_late(self) -> str | None:
         """Return what to tell the user if the last words are too old to be sent, or None."""
@@ -210,10 +210,10 @@ class GuardProcess:
 
     def _speak(self) -> str:
         """Send the last words of a guard that has died; return a description for the user."""
-        died_ns, words, newest = self._clock.now_ns(), self._words, self._newest
-        if words is None or newest is None or not words.packets:
+        died_ns, words = self._clock.now_ns(), self._words
+        if not words.packets:
             return "it held no sticks"
-        if newest.phase not in (words.phase, *_STILL_OURS):
+        if not self._holds_vehicle():
             return "it had released the sticks"
         if not self.wait(REAP_S):
             return f"it does not exit, so nothing was sent in its place; {OWN_TIMEOUT}"

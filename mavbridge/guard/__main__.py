@@ -101,11 +101,9 @@ def _run(
         raise
     finally:
         link.close()
-    engagement = loop.guard.engagement if loop.guard else None
     summary = GuardSummary(
         link=link.stats(),
-        failure=engagement.failure if engagement else None,
-        outcome=engagement.outcome if engagement else Outcome(),
+        outcome=loop.guard.engagement.outcome if loop.guard else Outcome(),
         params=dict(link.known_params),
         dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,

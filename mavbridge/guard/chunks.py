@@ -2,13 +2,12 @@
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
+from mavbridge.core.reasons import Code, Reason, because, too_old
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, Telemetry
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
 GRACE_PERIODS = 3
@@ -28,6 +27,7 @@ LEAST_GAPS = 2
 SLOW_CHUNKS = 5
 """Consecutive solves that take longer than the attitude's age limit and show that this computer is
 too slow for the policy. More than one, since the first solves after loading may be slow."""
+_UNSEEN = Telemetry()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,24 +108,19 @@ def late(
 ) -> Reason:
     """Return the reason to end a flight because an input is too old.
 
-    Args:
-        name: chunk: none arrived within the grace. horizon: the last chunk ended first.
-        age_ns: age of the input.
-        limit_ns: its limit.
-        place: where the time was lost.
-        spent_ns: time lost there.
-        said: why the flight process computed no chunk; None: it gave no reason.
+    ``name``: chunk: none arrived within the grace; horizon: the last chunk ended first.
+    ``place``: where ``spent_ns`` were lost. ``said``: why the flight process computed no chunk.
     """
-    is_horizon = name == "horizon"
-    reason = because(
-        Code.PAST_HORIZON if is_horizon else Code.LATE,
-        quantity="chunk" if is_horizon else name,
+    code, quantity = (Code.PAST_HORIZON, "chunk") if name == "horizon" else (Code.LATE, name)
+    return because(
+        code,
+        quantity=quantity,
         age_ms=age_ns / NS_PER_MS,
         limit_ms=limit_ns / NS_PER_MS,
         place=place,
         spent_ms=spent_ns / NS_PER_MS,
+        **({} if said is None else {"said": said}),
     )
-    return reason if said is None else Reason(reason.code, (*reason.data, ("said", said)))
 
 
 class ChunkBuffer:
@@ -148,9 +143,8 @@ class ChunkBuffer:
         self._limits = limits
         self._period_ns = period_ns
         self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
-        self._refused_ns: deque[int] = deque(maxlen=MAX_REFUSED)
-        self._malformation: Reason | None = None
-        """Defect of the last malformed chunk."""
+        self._malformed: deque[tuple[int, Reason]] = deque(maxlen=MAX_REFUSED)
+        """Times and defects of the last malformed chunks."""
         self._refusal: Reason | None = None
         """Why the newest chunk was not taken; None if it was."""
         self._is_stale = False
@@ -180,21 +174,19 @@ class ChunkBuffer:
         """Take a chunk if it may be flown. Return True if it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
-        self._word_ns, self._is_stale = now_ns, False
-        if (defect := self._malformed(chunk)) is not None:
+        self._refusal, self._is_stale, self._word_ns = None, False, now_ns
+        if (defect := self._defect(chunk)) is not None:
             self.explain_absence(defect, now_ns)
             return False
         self._solve_ns = chunk.computed_ns - chunk.attitude_ns
         self._slow = self._slow + 1 if self._solve_ns > self._limits.state_ns else 0
         end_ns, self._seen = self._horizon_end_ns(chunk, now_ns), chunk
-        if (staleness := self._stale(chunk, now_ns)) is not None:
-            self.explain_absence(staleness, now_ns)
-            self._is_stale = True
+        staleness = self._stale(chunk, now_ns)
+        if staleness is not None or now_ns > end_ns:
+            why = staleness or because(Code.AFTER_HORIZON, **_horizon(chunk))
+            self.explain_absence(why, now_ns)
+            self._is_stale = staleness is not None
             return False
-        if now_ns > end_ns:
-            self.explain_absence(because(Code.AFTER_HORIZON, **_horizon(chunk)), now_ns)
-            return False
-        self._refusal = None
         if self.newest is not None:
             self._gaps_ns.append(now_ns - self._taken_ns)
             gap_ns = now_ns - self._end_ns
@@ -223,8 +215,7 @@ class ChunkBuffer:
         """Note why there is no chunk; the flight process answers, so no stall is bridged."""
         self._refusal, self._is_stale, self._word_ns = reason, False, now_ns
         if reason.code in _MALFORMED:
-            self._refused_ns.append(now_ns)
-            self._malformation = reason
+            self._malformed.append((now_ns, reason))
         graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
         self._until_ns = min(self._until_ns, graced_ns)
 
@@ -271,17 +262,12 @@ class ChunkBuffer:
         """Return why the flight must end now, or None: grace over, or malformed chunks."""
         return self._malformed_lately(now_ns) or self.lateness(now_ns)
 
-    def is_over(self, now_ns: int) -> bool:
-        """True if the grace, or the allowed stall, has ended."""
-        return self.newest is None or now_ns > self._until_ns
-
     def lateness(
         self,
         now_ns: int,
         *,
         stood_ns: int = 0,
-        heard_ns: Mapping[str, int] | None = None,
-        lag_ns: int = 0,
+        seen: Telemetry = _UNSEEN,
         arriving: Chunk | None = None,
     ) -> Reason | None:
         """Return the reason with the input whose age ended the grace, or None during the grace.
@@ -289,11 +275,10 @@ class ChunkBuffer:
         Args:
             now_ns: current time.
             stood_ns: duration of the guard's stall until now.
-            heard_ns: arrival of the vehicle's newest "attitude" and "velocity", by these names.
-            lag_ns: time from measurement to arrival of the newest attitude.
+            seen: newest readings of the vehicle.
             arriving: chunk that has just arrived.
         """
-        if not self.is_over(now_ns):
+        if self.newest is not None and now_ns <= self._until_ns:
             return None
         said, silent_ns = None if self._is_stale else self._refusal, now_ns - self._word_ns
         if self._seen is None:
@@ -305,11 +290,14 @@ class ChunkBuffer:
             is_over = now_ns > self._end_ns
             name, happened_ns = "horizon" if is_over else "chunk", self._taken_ns
             limit_ns = (self._end_ns if is_over else self._until_ns) - self._taken_ns
+        turned, moved = seen.motion[:2], seen.motion[2:]
+        lag_ns = max([0, *(each.delay_ns for each in turned if each)])
+        source = {"attitude": turned, "velocity": moved}.get(name, ())
         spent: dict[Place, int] = {
             "flight process": silent_ns,
             "solve": self._solve_ns - lag_ns,
             "lag": lag_ns,
-            "link": now_ns - (heard_ns or {}).get(name, now_ns),
+            "link": max([0, *(now_ns - each.arrived_ns for each in source if each)]),
             "camera": self._word_ns - happened_ns if name == "image" else 0,
         }
         place = max(spent, key=lambda each: spent[each])
@@ -324,11 +312,9 @@ class ChunkBuffer:
 
     def _malformed_lately(self, now_ns: int) -> Reason | None:
         window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
-        refused = self._refused_ns
-        is_flood = len(refused) >= MAX_REFUSED and now_ns - refused[0] < window_ns
-        if not is_flood or self._malformation is None:
+        if len(self._malformed) < MAX_REFUSED or now_ns - self._malformed[0][0] >= window_ns:
             return None
-        return because(Code.UNUSABLE_CHUNKS, chunks=MAX_REFUSED, why=self._malformation)
+        return because(Code.UNUSABLE_CHUNKS, chunks=MAX_REFUSED, why=self._malformed[-1][1])
 
     @property
     def _is_short(self) -> bool:
@@ -376,12 +362,11 @@ class ChunkBuffer:
 
     def _stale(self, chunk: Chunk, now_ns: int) -> Reason | None:
         for name, happened_ns, limit_ns in self._ages(chunk):
-            if now_ns - happened_ns > limit_ns:
-                age_ms, limit_ms = (now_ns - happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
-                return because(Code.TOO_OLD, quantity=name, age_ms=age_ms, limit_ms=limit_ms)
+            if (age_ns := now_ns - happened_ns) > limit_ns:
+                return too_old(name, age_ns, limit_ns)
         return None
 
-    def _malformed(self, chunk: Chunk) -> Reason | None:
+    def _defect(self, chunk: Chunk) -> Reason | None:
         if not chunk.actions or chunk.step_ns <= 0:
             return because(Code.EMPTY_CHUNK)
         if set(map(type, chunk.actions)) != {self._class}:

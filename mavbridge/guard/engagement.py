@@ -59,8 +59,8 @@ class Engagement(Memory):
 
     def stop(self, request: EndRequest) -> None:
         """Give the sticks back as the request demands, then enter ``ENDED``; the first counts."""
-        is_own = self.end_request is not None and self.end_request.reason is self.failure
-        if self.end_request is None or is_own:  # our own: a start that failed ends the guard
+        # Our own request, after a start that failed, gives way to another one.
+        if self.end_request is None or self.end_request.reason is self.outcome.failure:
             self.end_request, self.must_stop = request, True
 
     def step(self, now: EngagementInputs, act: OperatorCommand | None) -> Actions:
@@ -245,9 +245,9 @@ class Engagement(Memory):
         if self.phase in (Phase.PREPARING, Phase.FLYING):
             twin.stop(EndRequest(because(Code.GUARD_DIED), end="fault"))
         # Sticks jump to neutral unseen; the flight process sends the words at once, or never.
-        link = replace(now.link, are_sticks_at_rest=False)
         status = replace(now.status, mode_arrived_ns=None)
-        now = replace(now, link=link, status=status, heard_ns=None)
+        link = replace(now.link, status=status, are_sticks_at_rest=False)
+        now = replace(now, link=link, heard_ns=None)
         rests = bool(now.link.modes.override) and not self.settings.is_setpoint
         rest_ns = STICK_REST_NS if rests else 0
         until_ns = rest_ns + _ASKED_NS

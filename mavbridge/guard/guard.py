@@ -26,7 +26,6 @@ from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, ne
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.table import switch_unseen
 from mavbridge.guard.values import (
-    NOT_FOUND,
     Actions,
     ControlSource,
     EndRequest,
@@ -74,11 +73,11 @@ class Guard:
     """Decides which sticks are sent, and when."""
 
     def __init__(self, settings: FlightSettings, now_ns: int) -> None:
+        self.settings = settings
         self._chunks = ChunkBuffer(
             settings.freshness, period_ns=settings.chunk_period_ns, kind=settings.meaning.kind
         )
-        self._meaning = settings.meaning
-        self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
+        self._neutral, self._idle = neutral_action(settings.meaning), idle_action(settings.meaning)
         self._smoother = ActionSmoother(settings.smoothing, self._neutral)
         self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
         """Lead for sampling a chunk, at most to its end; compensates the low-pass lag."""
@@ -122,7 +121,7 @@ class Guard:
     def unsent(self) -> None:
         """Discard the last decision, which was not sent; continue from the one before, without a
         jump for the time that has passed. A read-only flight goes on as if it were sent."""
-        if not self.engagement.settings.readonly:
+        if not self.settings.engagement.readonly:
             tried_ns, (state, self._last) = self._smoother.state.stepped_ns, self._before
             self._smoother.state = state._replace(stepped_ns=tried_ns)
             self._grid.unserve()
@@ -131,14 +130,15 @@ class Guard:
         """Advance to ``now_ns`` with the given news; return the actions to take."""
         # Before the new chunk is taken: a stall of the guard itself may have ended the grace.
         stood_ns, self._stepped_ns = now_ns - self._stepped_ns, now_ns
-        overdue = self._overdue(now_ns, stood_ns, given)
+        seen = given.link.telemetry
+        overdue = self._chunks.lateness(now_ns, stood_ns=stood_ns, seen=seen, arriving=given.chunk)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
         if given.absence is not None:
             self._chunks.explain_absence(given.absence, now_ns)
         if given.stop is not None:
             self.engagement.stop(given.stop)
         phase_before = self.engagement.phase
-        silence = self._silence(now_ns, stood_ns, given.link.telemetry.ned_from_body_wxyz)
+        silence = self._silence(now_ns, stood_ns, seen.ned_from_body_wxyz)
         inputs = self._seen = self._inputs(now_ns, given, overdue or silence)
         actions = self.engagement.step(inputs, given.act)
         self._change_control(actions.control, now_ns, given.link)
@@ -187,36 +187,12 @@ class Guard:
         age_ns = now_ns - attitude.arrived_ns
         return late("attitude", age_ns, limit_ns, "link", age_ns)
 
-    def _overdue(self, now_ns: int, stood_ns: int, given: GuardInput) -> Reason | None:
-        """Return the reason if an input of the policy's flight is too late, or None."""
-        if self.engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
-            return None
-        seen = given.link.telemetry
-        readings = {
-            "attitude": (seen.ned_from_body_wxyz, seen.rate_body_radps),
-            "velocity": (seen.velocity_ned_mps, seen.specific_force_body_mps2),
-        }
-        return self._chunks.lateness(
-            now_ns,
-            stood_ns=stood_ns,
-            heard_ns={
-                name: min(reading.arrived_ns for reading in pair if reading is not None)
-                for name, pair in readings.items()
-                if any(pair)
-            },
-            lag_ns=max([0, *(each.delay_ns for each in readings["attitude"] if each)]),
-            arriving=given.chunk,
-        )
-
     def _inputs(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> EngagementInputs:
         link, status = given.link, given.link.status
-        chunk_fault = given.command_fault or overdue
-        is_flying = self.engagement.phase is Phase.FLYING
-        if chunk_fault is None and is_flying:
-            chunk_fault = self._chunks.fault(now_ns)
         # These block only an engagement, so they are skipped in flight. A read-only flight is only
         # shown as FLYING, so they are always checked there.
-        is_sought = not is_flying or self.engagement.settings.readonly
+        is_flying = self.engagement.phase is Phase.FLYING
+        is_sought = not is_flying or self.settings.engagement.readonly
         starting_ns, newest = self.engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns
         left: Reason | None = None
@@ -226,12 +202,11 @@ class Guard:
         return EngagementInputs(
             now_ns=now_ns,
             link=link,
-            status=status or NOT_FOUND,
             heard_ns=_newest(link),
             chunk_problem=self._chunks.problem(now_ns) if is_sought else None,
-            chunk_fault=chunk_fault,
-            command_failed=given.command_fault is not None,
-            slowness=given.command_fault or (self._chunks.impossibility if is_sought else None),
+            chunk_fault=overdue or self._chunks.fault(now_ns),
+            command_fault=given.command_fault,
+            slowness=self._chunks.impossibility if is_sought else None,
             is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
             envelope_problem=None if has_landed else left,
             landing=left if has_landed else None,
@@ -265,9 +240,9 @@ class Guard:
 
         A wrong velocity would last long: at 5 m/s^2 the way back from 100 m/s takes 20 s.
         """
-        first = first_action(self._meaning, link.telemetry, pilot)
-        is_velocity = self._meaning.kind == "velocity"
-        return self._smoother.limits.clip(first) if is_velocity else first
+        meaning = self.settings.meaning
+        first = first_action(meaning, link.telemetry, pilot)
+        return self._smoother.limits.clip(first) if meaning.kind == "velocity" else first
 
     def _decide(
         self, control: ControlSource | None, now_ns: int, *, is_thrust: bool
@@ -276,18 +251,19 @@ class Guard:
 
         ``is_thrust``: the throttle stick is thrust in the present mode.
         """
+        kind = self.settings.meaning.kind
         if control is not ControlSource.POLICY:
             decision = self._at_rest(control)
             if not isinstance(decision, Release | None):
-                is_neutral = control is ControlSource.NEUTRAL
-                if is_neutral and self._meaning.kind == "velocity":  # brake within the limits
+                if kind == "velocity" and control is ControlSource.NEUTRAL:
+                    # Brake within the limits.
                     decision = self._smoother.step(self._neutral, now_ns).smoothed
                 self._last = decision
             return decision, None
         raw = self._chunks.action_at(now_ns, self._lead_ns)
         # Beyond the horizon, level sticks bridge the rest of the grace.
         level = self._level(is_thrust=is_thrust)
-        if raw is None and self._meaning.kind == "rates":  # level is an attitude then: no filter
+        if raw is None and kind == "rates":  # level is an attitude then: no filter
             trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
         else:
             trace = self._smoother.step(raw or level, now_ns)

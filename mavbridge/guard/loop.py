@@ -27,6 +27,7 @@ from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import (
+    NO_WORDS,
     GuardStatus,
     LastWords,
     Packets,
@@ -92,22 +93,22 @@ class GuardLoop:
         self._vehicle: VehicleStatus | None = None
         self._status: GuardStatus | None = None
         """Last status sent to the flight process."""
-        self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: EndRequest | None = None
         self._command_fault: Reason | None = None
         """Error of the last pass while a command was encoded or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
-        self._words = LastWords(self._phase, None, None, brings_file=False, packets=())
+        self._words = NO_WORDS
         """Newest last words: packets that make the vehicle safe if this process dies."""
         self._words_basis: object = None
         self._words_due_ns = 0
         self._words_outlet: Outlet | None = None
         """Outlet that the flight process holds open."""
         self._known: object = None
-        """State of the link and the vehicle at the last pass, motion excluded."""
+        """State of the link and the vehicle at the guard's last step, motion excluded."""
         self._stepped_ns = 0
+        """Time of the guard's last step."""
         self._reports = 0
         """Number of ticks sent to the flight process, with those that it did not take."""
         self.is_done = False
@@ -199,9 +200,12 @@ class GuardLoop:
         # Compute for a slot that is about to come due, so that only the send is left.
         now_ns, slot_ns = self._clock.now_ns(), self.guard.next_ns
         at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
-        if not self._has_work(snapshot, given, at_ns, slot_ns):
+        status = snapshot.status
+        known = (_LINK(snapshot), status and _STATUS(status), self._link.outlet)
+        if not self._has_work(known, given, at_ns, slot_ns):
             self._link.service()
             return self.guard.next_ns - self._lead_ns
+        self._known, self._stepped_ns = known, at_ns
         self._watch_input(at_ns, given)
         output = self.guard.step(at_ns, given)
         wanted = output.decision
@@ -227,22 +231,14 @@ class GuardLoop:
         # After a failed command the next pass follows at once.
         return woke_ns if self._command_fault else self.guard.next_ns - self._lead_ns
 
-    def _has_work(
-        self, snapshot: LinkSnapshot, given: GuardInput, at_ns: int, slot_ns: int
-    ) -> bool:
+    def _has_work(self, known: object, given: GuardInput, at_ns: int, slot_ns: int) -> bool:
         """True if the guard must step.
 
         False in flight, between slots, within 10 ms of a step, if only motion has changed.
         """
-        status = snapshot.status
-        known = (_LINK(snapshot), status and _STATUS(status), self._link.outlet)
-        before, self._known = self._known, known
         is_called = given.chunk or given.absence or given.act or given.stop or given.command_fault
         is_due = at_ns >= min(slot_ns, self._stepped_ns + IDLE_PERIOD_NS)
-        has_work = self._phase is not Phase.FLYING or is_called or is_due or before != known
-        if has_work:
-            self._stepped_ns = at_ns
-        return bool(has_work)
+        return self._phase is not Phase.FLYING or is_due or known != self._known or bool(is_called)
 
     def _report_tick(self, tick: GuardTick, woke_ns: int, sent: Action | None) -> None:
         told = replace(
@@ -316,16 +312,17 @@ class GuardLoop:
             self._flight.send(encode_from_guard(text))
 
     def _report_status(self, vehicle: VehicleStatus | None) -> None:
-        is_read = self.guard is not None
+        settings = None if self.guard is None else self.guard.settings
+        watches_position = settings is not None and settings.watches_position
         status = GuardStatus(
             autopilot=self._link.autopilot,
             mode=vehicle.mode if vehicle else None,
             armed=vehicle is not None and vehicle.armed,
             is_landed=vehicle.is_landed if vehicle else None,
             # They change with each message, and nobody reads before a policy is loaded.
-            rc_channels_us=vehicle.rc_channels_us if vehicle and is_read else (),
-            rc_sticks=vehicle.rc_sticks if vehicle and is_read else None,
-            has_position=self._watches_position and bool(vehicle and vehicle.position_ned_m),
+            rc_channels_us=vehicle.rc_channels_us if vehicle and settings else (),
+            rc_sticks=vehicle.rc_sticks if vehicle and settings else None,
+            has_position=watches_position and bool(vehicle and vehicle.position_ned_m),
         )
         if status != self._status:  # one that the channel did not take is sent again
             self._status = status if self._flight.send(encode_from_guard(status)) else None
@@ -351,7 +348,6 @@ class GuardLoop:
                     pass
                 case FlightSettings() as settings if self.guard is None:
                     self.guard = Guard(settings, self._clock.now_ns())
-                    self._watches_position = settings.watches_position
                     self._link.begin_flight(
                         settings.meaning,
                         settings.output,

@@ -43,8 +43,6 @@ class Memory:
     """Why the policy does not fly; None while it does."""
     refusal: Reason | None = None
     """Failure of the last act, or missing confirmation by the vehicle; the reader resets it."""
-    failure: Reason | None = None
-    """Why there was no flight: the vehicle did not take the mode or arm in time."""
     outcome: Outcome = field(default_factory=Outcome)
     act: OperatorCommand | None = None
     """Act of this step, from any source, until a row handles it."""
@@ -148,7 +146,7 @@ class Memory:
         if self.is_act:
             self.refusal = cause.reason  # the act may be repeated
         else:
-            self.failure, self.end_request = cause.reason, cause
+            self.outcome, self.end_request = self.outcome._replace(failure=cause.reason), cause
 
     def fly(self, now: EngagementInputs, _cause: object) -> None:
         """the policy's actions, starting from the pilot's or idle sticks"""

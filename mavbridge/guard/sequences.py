@@ -113,7 +113,7 @@ class EngageSequence:
         """Return why waiting will not help, or None."""
         names, wanted = now.link.modes.names, self.wanted_mode(now)
         if wanted is None or not names or wanted in names:
-            return now.slowness
+            return now.command_fault or now.slowness
         return because(Code.NO_SUCH_MODE, mode=wanted, modes=", ".join(names))
 
     def step(self, now: EngagementInputs, objection: Reason | None) -> Actions:
@@ -314,7 +314,7 @@ class DisengageSequence:
         if self.settings.is_setpoint or not now.link.modes.override:
             return True
         is_bounded = now.now_ns - self.began_ns >= STICK_REST_NS
-        self.has_failed = self.has_failed or now.command_failed
+        self.has_failed = self.has_failed or now.command_fault is not None
         if self.has_failed:
             return is_bounded  # the time at which neutral was sent is unknown
         return is_bounded or (now.link.are_sticks_at_rest and now.now_ns > self.began_ns)

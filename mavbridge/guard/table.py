@@ -189,7 +189,7 @@ def fault(m: Memory, now: EngagementInputs) -> EndRequest | None:
     sends from another address; a command could not be encoded; the engage switch is unseen for 1 s;
     or ArduPilot keeps the mode in a failsafe.
     """
-    problem = now.link.problem or now.chunk_fault or now.envelope_problem
+    problem = now.link.problem or now.command_fault or now.chunk_fault or now.envelope_problem
     reason = problem or _failsafe(m, now, keeps_mode=True) or switch_unseen(m, now)
     return None if reason is None else EndRequest(reason, "fault")
 

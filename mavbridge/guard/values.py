@@ -66,6 +66,8 @@ class Outcome(NamedTuple):
     """How the last flight ended; None before that."""
     fault: Reason | None = None
     """Newest fault of ours that has ended a flight; None: none has."""
+    failure: Reason | None = None
+    """Why there was no flight: the vehicle did not take the mode or arm in time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,24 +123,27 @@ class EngagementInputs:
 
     now_ns: int
     link: LinkSnapshot
-    status: VehicleStatus
-    """The link's, or ``NOT_FOUND``."""
     heard_ns: int | None = None
     """Newest arrival of a mode, RC_CHANNELS or an attitude; None: now."""
     chunk_problem: Reason | None
     """Why no flight may begin now: no fresh chunk."""
     chunk_fault: Reason | None
-    """Why a flight must end now: no chunk for longer than the grace, or a failed command."""
-    command_failed: bool
-    """True if the last command failed, so that the vehicle has not received it."""
+    """Why a flight must end now: no chunk for longer than the grace."""
+    command_fault: Reason | None = None
+    """Why the last command failed, so that the vehicle has not received it."""
     is_policy_reset: bool
     """True if the newest chunk was solved after the reset for the flight that starts."""
     slowness: Reason | None = None
-    """Why the policy can never fly: too slow, or a failed command."""
+    """Why the policy can never fly: it is too slow."""
     envelope_problem: Reason | None
     """The exceeded limit of the flight envelope, or None."""
     landing: Reason | None = None
     """Landing under the policy, a normal end; None: none."""
+
+    @property
+    def status(self) -> VehicleStatus:
+        """The vehicle's status, or ``NOT_FOUND``."""
+        return self.link.status or NOT_FOUND
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -85,6 +85,10 @@ class LastWords(NamedTuple):
     """Delay after the death [ns] and bytes of each packet; empty: nothing is held, send nothing."""
 
 
+NO_WORDS = LastWords(Phase.WAITING, None, None, brings_file=False, packets=())
+"""Last words of a guard that has held nothing yet."""
+
+
 class GuardDiedError(MavbridgeError):
     """The guard process exited without its summary, or stands still."""
 
@@ -96,8 +100,6 @@ class GuardSummary:
     """Last message of a guard that ends normally."""
 
     link: LinkStats
-    failure: Reason | None
-    """Why there was no flight, or None."""
     outcome: Outcome
     params: dict[str, float]
     """The vehicle's flight-relevant parameters that have been read, by name."""

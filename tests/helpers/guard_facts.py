@@ -78,10 +78,8 @@ AIRBORNE = EngagementInputs(
         echo_confirmed=True,
         is_released=False,
     ),
-    status=_STATUS,
     chunk_problem=None,
     chunk_fault=None,
-    command_failed=False,
     is_policy_reset=True,
     envelope_problem=None,
 )
@@ -101,7 +99,7 @@ def altered(facts: EngagementInputs, **changes: Any) -> EngagementInputs:
         for record in (VehicleStatus, LinkSnapshot)
     )
     if status:
-        changes["status"] = link["status"] = replace(facts.status, **status)
+        link["status"] = replace(facts.status, **status)
     return replace(facts, link=replace(facts.link, **link), **changes)
 
 

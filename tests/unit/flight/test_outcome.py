@@ -43,7 +43,6 @@ STATS = LinkStats(
 def summary(outcome: Outcome) -> GuardSummary:
     return GuardSummary(
         link=STATS,
-        failure=None,
         outcome=outcome,
         params={},
         dropped_messages=0,

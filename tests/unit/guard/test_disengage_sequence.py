@@ -501,9 +501,9 @@ def test_old_data_comes_out_of_pipes_for_50_ms_after_a_standstill() -> None:
 
 def test_a_command_that_failed_delays_only_its_own_way_out() -> None:
     sequence, asked = DisengageSequence(engagement_settings()), []
-    for command_failed in (True, False):
+    for fault in (because(Code.COMMAND_FAILED), None):
         sequence.begin(PX4, is_planned=False)
-        facts = altered(PX4, now_ns=PX4.now_ns + NS_PER_MS, command_failed=command_failed)
+        facts = altered(PX4, now_ns=PX4.now_ns + NS_PER_MS, command_fault=fault)
         asked.append(sequence.step(facts, None).mode)
     assert asked == [None, "AUTO.LOITER"]
 

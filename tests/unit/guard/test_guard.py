@@ -389,7 +389,7 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     guard = Stepped().engaged()
     for at_ms in range(40, 740, 10):
         guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
-    assert guard.guard.engagement.outcome.end == "fault"
+    assert guard.outputs[-1].tick.end == "fault"
     assert because(Code.BATTERY) in [o.tick.release_reason for o in guard.outputs]
 
 
@@ -408,14 +408,14 @@ def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
     guard = Stepped(arm=True, status={"armed": False})
     for k in range(8):
         guard.step(10 * k, guard.chunk(10 * k)._replace(attitude_ns=START_NS - 400 * MS))
-    assert codes(guard.guard.engagement.failure) == (Code.TOO_SLOW,)
+    assert codes(guard.guard.engagement.outcome.failure) == (Code.TOO_SLOW,)
 
 
 def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
     guard = Stepped(arm=True, status={"armed": False})
     guard.step(0, guard.chunk(0))
     guard.step(10, fault=because(Code.COMMAND_FAILED))
-    assert guard.guard.engagement.failure == because(Code.COMMAND_FAILED)
+    assert guard.guard.engagement.outcome.failure == because(Code.COMMAND_FAILED)
 
 
 def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -> None:
@@ -621,7 +621,7 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
         START_NS + MS, GuardInput(link=link, stop=EndRequest(reason=because(Code.SIGNAL)))
     )
     assert (ended.tick.phase, ended.decision) == (Phase.ENDED, None)
-    assert guard.engagement.failure is None
+    assert guard.engagement.outcome.failure is None
 
 
 @pytest.mark.parametrize("tau_s", [0.0, 0.05])
