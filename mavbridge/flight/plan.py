@@ -1,11 +1,12 @@
 """Everything that follows from a flight's flags and contract, resolved once."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import LoopRates
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.flight.settings import (
+    AGES,
     TAU_S,
     action_limits,
     action_meaning,
@@ -42,26 +43,15 @@ class FlightPlan:
 
     def figures(self) -> dict[str, float]:
         """Return rates, periods and limits by name, for ``check`` and ``meta.json``."""
-        limits, smoothing, envelope = (
-            self.guard.freshness,
-            self.guard.smoothing,
-            self.guard.envelope,
-        )
+        ages_ns, envelope = self.guard.freshness, asdict(self.guard.envelope)
         return {
             "vision_hz": self.loops.vision_hz,
             "action_hz": self.loops.action_hz,
             "stick_hz": self.config.rates.stick_rate,
             "state_hz": self.loops.state_hz,
-            "max_attitude_age_s": limits.state_ns / NS_PER_S,
-            "max_velocity_age_s": limits.velocity_ns / NS_PER_S,
-            "max_feature_age_s": limits.feature_ns / NS_PER_S,
-            "max_chunk_age_s": limits.chunk_ns / NS_PER_S,
-            "max_stall_s": limits.stall_ns / NS_PER_S,
-            "tau_s": smoothing.tau_s,
-            "max_tilt_deg": envelope.tilt_deg,
-            "max_height_m": envelope.height_m,
-            "max_speed_mps": envelope.speed_mps,
-            "max_distance_m": envelope.distance_m,
+            **{f"{flag}_s": getattr(ages_ns, age) / NS_PER_S for age, (_, flag) in AGES.items()},
+            "tau_s": self.guard.smoothing.tau_s,
+            **{f"max_{quantity}": limit for quantity, limit in envelope.items()},
         }
 
 

@@ -160,7 +160,7 @@ def envelope_limits(config: EnvelopeConfig, contract: Contract) -> EnvelopeLimit
     )
 
 
-_AGES = {
+AGES = {
     "state_ns": ("max_state_age_s", "max_attitude_age"),
     "velocity_ns": ("max_velocity_age_s", "max_velocity_age"),
     "feature_ns": ("max_feature_age_s", "max_feature_age"),
@@ -177,7 +177,7 @@ def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
         UserError: a flag would loosen a limit of the contract.
     """
     ages_ns: dict[str, int] = {}
-    for name, (own, flag) in _AGES.items():
+    for name, (own, flag) in AGES.items():
         allowed_s, asked_s = getattr(contract, own), getattr(limits, flag)
         if asked_s is not None and asked_s > allowed_s:
             raise UserError(
@@ -193,5 +193,5 @@ def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
 
     For simulated flights only, which measure the effect of an age on a policy.
     """
-    asked_s = {own: getattr(limits, flag) for own, flag in _AGES.values()}
+    asked_s = {own: getattr(limits, flag) for own, flag in AGES.values()}
     return replace(contract, **{own: s for own, s in asked_s.items() if s is not None})
