@@ -33,7 +33,7 @@ def rolled_forward(
         return telemetry
     w, x, y, z = attitude.values
     start = VehicleMotion((w, x, y, z), _three(rate), _three(velocity), _three(force))
-    actions = [_four(flown_at(now_ns + step * dt_ns)) for step in range(steps)]
+    actions = [flown_at(now_ns + step * dt_ns) for step in range(steps)]
     end = model.after(start, actions, dt_ns / NS_PER_S)
     half_s = (until_ns - now_ns) / NS_PER_S / 2
     north, east, down = (
@@ -47,11 +47,6 @@ def rolled_forward(
         position_ned_m=_moved(telemetry.position_ned_m, (north, east, down), until_ns),
         height_above_home_m=_moved(telemetry.height_above_home_m, (-down,), until_ns),
     )
-
-
-def _four(action: Action) -> tuple[float, float, float, float]:
-    a, b, c, d = action
-    return a, b, c, d
 
 
 def _three(reading: Reading) -> tuple[float, float, float]:
