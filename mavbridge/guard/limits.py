@@ -73,24 +73,22 @@ def neutral_action(meaning: ActionMeaning) -> Action:
 
     For body rates it is an attitude, since zero rates would keep a lean.
     """
-    match meaning.kind:
-        case "sticks":
-            return NEUTRAL
-        case "velocity":
-            return Velocity(0.0, 0.0, 0.0, 0.0)
-        case _:
-            return AttitudeThrust(meaning.hover_thrust, 0.0, 0.0, 0.0)
+    return _level_action(meaning, NEUTRAL, meaning.hover_thrust)
 
 
 def idle_action(meaning: ActionMeaning) -> Action:
     """Return the action that keeps an armed vehicle on the ground."""
+    return _level_action(meaning, IDLE, 0.0)
+
+
+def _level_action(meaning: ActionMeaning, sticks: Sticks, thrust: float) -> Action:
     match meaning.kind:
         case "sticks":
-            return IDLE
+            return sticks
         case "velocity":
             return Velocity(0.0, 0.0, 0.0, 0.0)
         case _:
-            return AttitudeThrust(0.0, 0.0, 0.0, 0.0)
+            return AttitudeThrust(thrust, 0.0, 0.0, 0.0)
 
 
 def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | None) -> Action:
