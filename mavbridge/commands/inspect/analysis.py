@@ -1,7 +1,7 @@
 """Analysis of a recorded flight: figures, who held the sticks, and the worst moments."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from mavbridge.observe.terminal import BAD, POOR, Finding, findings, number, rat
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording import replay_files
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
-from mavbridge.recording.folder import PACKETS, SOLVES, FlightMeta
+from mavbridge.recording.folder import PACKETS, SOLVES
 from mavbridge.recording.replay_files import read_settings
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import read_table, table_exists
@@ -129,8 +129,8 @@ class FlightAnalysis:
         damage = [text for camera in opened for text in camera.damage]
         self.start_ns = ticks[0].woke_ns if ticks else meta.start_ns
         """Wake-up of the first tick, on the clock of all stamps."""
-        self.stick_hz = _stick_hz(ticks, meta)
-        """Rate of the stick grid, derived from the slots themselves."""
+        self.stick_hz = meta.plan.get("stick_hz", meta.action_hz)
+        """Rate of the stick grid; without a policy, of the rows."""
         self.report = _report(opened, ticks, frames, self.stick_hz)
         """Figures of the table that ended the flight, except for those of the link; vision is that
         of the first camera."""
@@ -169,19 +169,6 @@ class FlightAnalysis:
             if delay.cause is not None:
                 counts[delay.cause] += delay.count
         return tuple(counts.most_common())
-
-
-def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
-    """Return the stick rate by the slots and their numbers; without slots, the action rate.
-
-    A new chunk sent shortly before a slot stands for it, so that more than half may be absent.
-    """
-    slots = [(tick.index, tick.due_ns) for tick in ticks if tick.is_slot and tick.due_ns > 0]
-    steps, gaps_ns = np.diff(np.array(slots, np.int64).reshape(-1, 2), axis=0).T
-    is_later = (steps > 0) & (gaps_ns > 0)
-    if not is_later.any():
-        return meta.action_hz
-    return round(NS_PER_S / float(np.median(gaps_ns[is_later] / steps[is_later])), 1)
 
 
 def _report(

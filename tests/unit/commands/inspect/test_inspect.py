@@ -130,15 +130,6 @@ def test_plots_hold_what_was_sent_and_axes_of_ros_become_ned_axes(tmp_path: Path
         assert last[title] == pytest.approx(expected, abs=1e-3), title
 
 
-def test_chunks_that_stand_for_most_slots_do_not_change_the_stick_rate(tmp_path: Path) -> None:
-    """A real flight's chunks had come shortly before more than half of the 100 Hz slots."""
-    ticks = [
-        tick if tick.index % 3 == 0 else replace(tick, is_slot=False, index=-1)
-        for tick in flown(100)
-    ]
-    assert FlightAnalysis(write(tmp_path / "flight", ticks)).stick_hz == 100.0
-
-
 def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Path) -> None:
     steady = [make_tick(index, predict_ns=4 * NS_PER_MS) for index in range(100)]
     outcome = read_meta(GOLDEN / "toge_ardupilot").outcome
@@ -289,7 +280,7 @@ def test_facts_that_nothing_can_be_counted_with_are_refused_by_name(
     folder = write(tmp_path / "flight", [make_tick(0)])
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | damage))
-    with pytest.raises(MavbridgeError, match=f"meta.json: {next(iter(damage))} is"):
+    with pytest.raises(MavbridgeError, match=f"meta.json.*: {next(iter(damage))} is"):
         FlightAnalysis(folder)
 
 
