@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -25,9 +24,8 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.files import require_writable
+from mavbridge.core.files import from_json, require_writable
 from mavbridge.core.provenance import digests, git_revision, versions
-from mavbridge.core.reasons import reason_from_json
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_files
 from mavbridge.flight.settings import contract_with_ages
@@ -151,9 +149,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
     try:
         document = read_json(path)
         held_by, engine = document["flown_by"], str(document["engine"])
-        episodes = [
-            FlownEpisode(engine=engine, result=_from_json(one)) for one in document["episodes"]
-        ]
+        flown = [from_json(EpisodeResult, one) for one in document["episodes"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"--resume: {path} is no evaluation that can go on ({error!r}): name another --json"
@@ -164,7 +160,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
             "name another --json"
         )
     first = config.policy.seed * MAX_EPISODES
-    by_index = {episode.result.seed - first: episode for episode in episodes}
+    by_index = {one.seed - first: FlownEpisode(engine=engine, result=one) for one in flown}
     if by_index and max(by_index) >= config.episodes:
         raise UserError(
             f"--resume: {path} holds {len(by_index)} flights: ask for as many --episodes or more"
@@ -292,12 +288,6 @@ def summarise(episodes: Sequence[EpisodeResult]) -> dict[str, Estimate | None]:
 
 def _outcomes(episodes: Sequence[EpisodeResult]) -> dict[str, int]:
     return dict(Counter(one.outcome for one in episodes).most_common())
-
-
-def _from_json(document: dict[str, Any]) -> EpisodeResult:
-    lost = None if document["lost"] is None else reason_from_json(document["lost"])
-    times_s = tuple(document["gate_times_s"])
-    return EpisodeResult(**document | {"gate_times_s": times_s, "lost": lost})
 
 
 def as_document(

@@ -7,9 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from mavbridge.core.errors import UserError
-from mavbridge.core.reasons import Reason, reason_to_json
+from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
+
+_T = TypeVar("_T")
 
 
 def require_writable(path: Path | None, flag: str) -> None:
@@ -94,6 +97,45 @@ def _plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"{value!r} has no form in JSON")
+
+
+def from_json(cls: type[_T], document: object) -> _T:
+    """Rebuild a dataclass from the JSON of ``as_json``; keys of later versions are ignored.
+
+    Raises:
+        KeyError, TypeError, ValueError: a key is missing, or a value is not of its field's type.
+    """
+    if not isinstance(document, dict):
+        raise TypeError(f"{document!r} is no object")
+    hints = get_type_hints(cls)
+    names = [field.name for field in fields(cls) if field.name in document]  # type: ignore[arg-type]
+    return cls(**{name: _typed(name, hints[name], document[name]) for name in names})
+
+
+def _typed(name: str, hint: Any, value: Any) -> Any:
+    """Convert a value of JSON to the type of its field; raise TypeError if it has another one."""
+    kinds, container = get_args(hint) or (hint,), get_origin(hint)
+    if container is tuple:
+        return tuple(_typed(name, kinds[0], each) for each in _typed(name, list, value))
+    if container is dict:
+        return {
+            key: _typed(name, kinds[1], each) for key, each in _typed(name, dict, value).items()
+        }
+    if isinstance(value, dict):
+        if Reason in kinds:
+            return reason_from_json(value)
+        for kind in kinds:
+            if own := getattr(kind, "from_json", None):  # of text, with versions
+                return own(json.dumps(value))
+            if isinstance(kind, type) and is_dataclass(kind):
+                return from_json(kind, value)
+    if Path in kinds and isinstance(value, str):
+        return Path(value)
+    is_choice = container is Literal and value in kinds
+    if is_choice or type(value) in kinds or (type(value) is int and float in kinds):
+        return value
+    wanted = " or ".join(str(getattr(kind, "__name__", kind)) for kind in kinds)
+    raise TypeError(f"{name} is {value!r}, not {wanted}")
 
 
 def write_durably(path: Path, text: str) -> None:

@@ -2,17 +2,15 @@
 facts about the flight, its policy and its contract. Imports no extra.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.files import as_json, write_durably
-from mavbridge.core.reasons import reason_from_json
+from mavbridge.core.files import as_json, from_json, write_durably
 from mavbridge.core.records import FlightOutcome
 from policy.contract import Contract
 from policy.errors import ContractError, require_packages
@@ -208,29 +206,14 @@ def _unreadable(folder: Path) -> str:
 
 
 def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
-    """Read the document. Keys of later versions are ignored; keys of this version must be present
-    and valid."""
-    known = {f.name: document[f.name] for f in fields(FlightMeta) if f.name in document}
     try:
-        known["contract"] = Contract.from_json(json.dumps(known["contract"]))
-        if known.get("outcome") is not None:
-            reason = known["outcome"]["reason"]
-            # A sentence without a code is not read back, because no decision can be based on it.
-            reason = reason_from_json(reason) if isinstance(reason, dict) else None
-            known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
-        known["command"] = tuple(known.get("command", ()))
-        meta = FlightMeta(**known)
+        meta = from_json(FlightMeta, document)
     except (KeyError, TypeError, ValueError, ContractError) as error:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
-    if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
-        raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")
     for name in ("action_hz", "visual_hz"):
-        value = getattr(meta, name)
-        if not (isinstance(value, int | float) and 0 < value < math.inf):  # also of NaN
-            raise FlightError(f"{folder / META}: {name} is {value!r}, not a rate above zero")
-    counts = ("course_seed", "ticks_dropped", "frames_dropped", "packets_dropped")
-    for name in ("start_ns", *(each for each in counts if getattr(meta, each) is not None)):
-        value = getattr(meta, name)
-        if not (isinstance(value, int) and value >= 0):
-            raise FlightError(f"{folder / META}: {name} is {value!r}, not a whole number")
+        if not 0 < getattr(meta, name) < math.inf:  # also of NaN
+            raise FlightError(f"{folder / META}: {name} is {getattr(meta, name)}, not above zero")
+    for name in ("start_ns", "course_seed", "ticks_dropped", "frames_dropped", "packets_dropped"):
+        if (getattr(meta, name) or 0) < 0:
+            raise FlightError(f"{folder / META}: {name} is {getattr(meta, name)}, below zero")
     return meta

@@ -3,15 +3,15 @@ policy's solves, features and packet stamps."""
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import NamedTuple
 
 import pyarrow as pa
 
 from mavbridge.config.flight import FlyConfig
-from mavbridge.core.files import as_json
+from mavbridge.core.files import as_json, from_json
 from mavbridge.core.provenance import without_secrets
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState, VisionTick
@@ -22,7 +22,6 @@ from mavbridge.recording.tables import Row, table_rows
 from policy.contract import ACTION_DIM, STATE_DIM, Contract
 from policy.files import read_json
 
-_T = TypeVar("_T")
 _NUMBERS = pa.list_(pa.float32())
 _SOLVE = ("serial", "started_ns", "computed_ns", "reset_ns", "image_ns", "first_ns", "step_ns")
 _ARRAYS = ("states", "history", "actions")
@@ -162,35 +161,13 @@ def write_settings(folder: Path, settings: ReplaySettings) -> None:
 def read_settings(folder: Path) -> ReplaySettings:
     """Read the file; raise FlightError if it is missing or not of this version."""
     try:
-        return _made(ReplaySettings, read_json(folder / SETTINGS))
+        return from_json(ReplaySettings, read_json(folder / SETTINGS))
     except FileNotFoundError as error:
         raise FlightError(
             f"{folder} has no {SETTINGS}: it was recorded by an older mavbridge, or is no flight "
             "of mavbridge fly --record; such a flight cannot be replayed"
         ) from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise FlightError(
             f"{folder / SETTINGS} is damaged, or of another version: {error}"
         ) from error
-
-
-def _made(cls: type[_T], document: dict[str, Any]) -> _T:
-    """Rebuild a dataclass from its ``asdict`` JSON; flags of later versions are ignored."""
-    hints = get_type_hints(cls)
-    names = [field.name for field in fields(cls) if field.name in document]  # type: ignore[arg-type]
-    return cls(**{name: _value(hints[name], document[name]) for name in names})
-
-
-def _value(hint: Any, value: Any) -> Any:
-    """Convert a value of JSON to the type of its field; raise TypeError if it has another one."""
-    if is_dataclass(hint) and isinstance(hint, type):
-        return _made(hint, value)
-    kinds = get_args(hint) or (hint,)
-    if get_origin(hint) is tuple:
-        return tuple(_value(kinds[0], each) for each in _value(list, value))
-    if Path in kinds and isinstance(value, str):
-        return Path(value)
-    is_choice = get_origin(hint) is Literal and value in kinds
-    if is_choice or type(value) in kinds or (type(value) is int and float in kinds):
-        return value
-    raise TypeError(f"{value!r} is no {hint}")

@@ -138,10 +138,10 @@ def _one_column_twice(flight: Path) -> None:
         (_meta(format="other"), "is not of a recorded flight"),
         (_meta(version=2), "has version 2 of the format, this build reads 1"),
         (_meta(contract={"horizon": 0}), "horizon must be an integer"),
-        (_meta(source="dream"), "source 'dream'"),
+        (_meta(source="dream"), "source is .dream., not flight or demonstration"),
         (_meta(outcome={"end": "duration"}), "incomplete or damaged"),
         (_meta(outcome="good"), "incomplete or damaged"),
-        (_meta(start_ns="now"), "start_ns is 'now', not a whole number"),
+        (_meta(start_ns="now"), "start_ns is .now., not int"),
     ],
 )
 def test_a_spoiled_flight_says_what_is_wrong(flight: Path, spoil: Spoil, told: str) -> None:
