@@ -367,7 +367,7 @@ class Percentiles:
 class LinkStats:
     """Counters of the link over one flight; None: not measured."""
 
-    messages_per_s: tuple[tuple[str, float], ...]
+    messages_per_s: dict[str, float]
     """Mean arrival rate by MAVLink message name."""
     lost_fraction: float | None
     rtt_ms: Percentiles | None

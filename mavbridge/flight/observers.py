@@ -30,7 +30,7 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
-from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_document
+from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops
 from mavbridge.recording.folder import FlightMeta, FlightSource, remove_flight, write_meta
 from policy.protocol import PolicyRunner
 
@@ -227,6 +227,6 @@ class FlightObservers:
             self.screen.show_message(describe(outcome))
         if self._config.report is not None:
             try:
-                self._config.report.write_text(as_json(report_document(report)))
+                self._config.report.write_text(as_json(report))
             except OSError as error:  # a full disk, no more open files
                 self.screen.show_message(f"--report {self._config.report}: {error.strerror}")

@@ -221,7 +221,7 @@ def flight_verdict(
 
 def log_link(summary: GuardSummary) -> None:
     """Log the received message rates and the parameters that were read."""
-    rates = (f"{name} {rate_hz:.1f}" for name, rate_hz in summary.link.messages_per_s)
+    rates = (f"{name} {rate_hz:.1f}" for name, rate_hz in summary.link.messages_per_s.items())
     _log.debug("received, in Hz: %s", ", ".join(rates))
     params = (f"{name}={value:g}" for name, value in sorted(summary.params.items()))
     _log.debug("parameters: %s", ", ".join(params))

@@ -1,6 +1,6 @@
 """Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
@@ -359,11 +359,3 @@ class _Span:
     @property
     def rate_hz(self) -> float | None:
         return round((self.count - 1) / self.duration_s, 3) if self.duration_s > 0 else None
-
-
-def report_document(report: TimingReport) -> dict[str, object]:
-    """Return the report for ``as_json``, with keys in the order of the dataclasses."""
-    document = {field.name: getattr(report, field.name) for field in fields(report)}
-    if (link := report.link) is not None:
-        document["link"] = asdict(link) | {"messages_per_s": dict(link.messages_per_s)}
-    return document

@@ -11,7 +11,7 @@ from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.commands.check.policy import check_policy
 from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
-from mavbridge.commands.check.soak import soak
+from mavbridge.commands.check.soak import Soak, soak
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import NO_POLICY, CheckConfig
 from mavbridge.commands.output import print_status, text_console, write_json
@@ -54,12 +54,12 @@ def check(config: CheckConfig) -> int:
         print_status(f"listening to the vehicle on {flight.link.connect}")
         rows = check_vehicle(flight, plan, clock)
     rows += [*cameras, *policy, *_computer_rows(flight.rates), *_file_rows(flight)]
-    soaked: dict[str, object] | None = None
+    soaked: Soak | None = None
     if config.soak is not None:
         print_status(f"flying the bundled vehicle for {config.soak:g} s")
         try:
-            result = soak(flight, clock, duration_s=config.soak)
-            soaked, row = result.document(), result.row()
+            soaked = soak(flight, clock, duration_s=config.soak)
+            row = soaked.row()
         except MavbridgeError as error:
             row = _computer_row("soak", "not flown", no_go=str(error))
         rows.append(row)

@@ -30,7 +30,7 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import patient_console
 from mavbridge.observe.terminal import number
-from mavbridge.observe.timing import FlightTiming, TimingReport, report_document
+from mavbridge.observe.timing import FlightTiming, TimingReport
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 
@@ -135,14 +135,11 @@ class Soak:
     computer: dict[str, object]
     """See ``this_computer``."""
     timing: TimingReport
+    """As in a flight's report."""
     cpu_cores: dict[str, float]
     """See ``UsageMeter.cores``."""
     hottest_c: float | None
     """Highest temperature [degrees Celsius]; None: this system tells none."""
-
-    def document(self) -> dict[str, object]:
-        """Return all figures as a JSON object; ``timing`` is as in a flight's report."""
-        return vars(self) | {"timing": report_document(self.timing)}
 
     def row(self) -> CheckRow:
         """Return the row of the check: a warning if a slot was missed or a rate was not held."""

@@ -153,10 +153,9 @@ def _link_rows(
     no_go = _DEAF if terms.is_deaf else no_go
     found = f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}"
     yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
-    rates_hz = dict(stats.messages_per_s)
     for group in streams:
         if group.is_needed and not terms.is_deaf:
-            yield _rate_row(group, rates_hz, terms.plan)
+            yield _rate_row(group, stats.messages_per_s, terms.plan)
     lost, uncounted = stats.lost_fraction, "no message came to count losses by"
     shown = "not measured" if lost is None else f"{shown_share(lost, 1)} of its messages"
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""

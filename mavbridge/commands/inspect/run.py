@@ -25,7 +25,6 @@ from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.terminal import BAD, Finding, number, timing_table
-from mavbridge.observe.timing import report_document
 from mavbridge.observe.viewer import RerunView
 from mavbridge.observe.viewer_layout import ViewedFlight
 from mavbridge.observe.viewer_target import check_target
@@ -186,7 +185,7 @@ def as_document(flight: FlightAnalysis) -> dict[str, object]:
         "folder": str(flight.folder),
         "damage": flight.damage,
         "stick_hz": flight.stick_hz,
-        "report": report_document(flight.report),
+        "report": flight.report,
         "image_latency_ms": flight.image_latency_ms,
         "causes": dict(flight.causes),
         "holders": flight.holders,

@@ -130,11 +130,11 @@ class LinkCounters:
         self._recent.clear()
 
     @property
-    def messages_per_s(self) -> tuple[tuple[str, float], ...]:
+    def messages_per_s(self) -> dict[str, float]:
         """Mean arrival rate by message name; empty before two arrivals."""
         span_ns = self.heard_ns - (self._first_ns or 0)
         counts = sorted(self._by_name.items()) if span_ns > 0 else ()
-        return tuple((name, count * NS_PER_S / span_ns) for name, count in counts)
+        return {name: count * NS_PER_S / span_ns for name, count in counts}
 
     @property
     def lost_fraction(self) -> float | None:

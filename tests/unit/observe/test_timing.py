@@ -19,10 +19,10 @@ from mavbridge.core.files import as_json
 from mavbridge.core.reasons import Code, Reason, because, reason_to_json
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
-from mavbridge.observe.timing import MAX_RELEASES, report_document
+from mavbridge.observe.timing import MAX_RELEASES
 
 LINK = LinkStats(
-    messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("RC_CHANNELS", 20.0)),
+    messages_per_s={"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
     lost_fraction=0.001,
     rtt_ms=None,
     sent_overrides=6000,
@@ -151,7 +151,7 @@ def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
 
 def test_the_json_holds_the_report_with_links_and_reasons_of_releases() -> None:
     report = report_of(make_released_tick(0), make_tick(1), link=LINK)
-    document = json.loads(as_json(report_document(report)))
+    document = json.loads(as_json(report))
     assert list(document) == [each.name for each in fields(report)]
     assert document["sticks"] == asdict(report.sticks)
     assert document["feature_age_ms"] == dict.fromkeys(("p50", "p99", "p999", "max"), 40.0)
