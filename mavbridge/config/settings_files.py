@@ -174,10 +174,6 @@ def _toml(value: Any) -> str | None:
     value = str(value) if isinstance(value, Path) else value
     if not (isinstance(value, tuple | str) and value):
         return None
-    # JSON has two escapes for a character beyond 16 bits, and TOML one.
-    return re.sub(r"\\ud[89ab]..\\ud[c-f]..", _long_escape, json.dumps(value))
-
-
-def _long_escape(pair: re.Match[str]) -> str:
-    character = json.loads(f'"{pair[0]}"')
-    return f"\\U{ord(character):08x}"
+    # Escaped: what JSON may hold as it is, and TOML or a terminal may not.
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", r"\u007f")
+    return text.encode(errors="backslashreplace").decode()
