@@ -22,6 +22,7 @@ from mavbridge.recording.folder import (
     video_of,
     write_meta,
 )
+from mavbridge.recording.replay_files import ReplaySettings
 from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogPipe
@@ -73,13 +74,13 @@ class FlightWriter:
         *,
         pressure: Pressure,
         with_labels: bool = False,
-        with_replay: bool = False,
+        settings: ReplaySettings | None = None,
         tlog_pipe: TlogPipe | None = None,
     ) -> None:
         """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
-        ``with_labels`` adds columns for the expert and ``FrameTruth``, ``with_replay`` the tables
-        for a replay. The reader of ``tlog_pipe`` becomes ``link.tlog`` and is closed here.
+        ``with_labels`` adds columns for the expert and ``FrameTruth``, ``settings`` the files for a
+        replay. The reader of ``tlog_pipe`` becomes ``link.tlog`` and is closed here.
         """
         self._folder = folder
         self.meta = meta
@@ -97,7 +98,9 @@ class FlightWriter:
             with self._writing():
                 self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
                 write_meta(folder, meta)
-                self._open_tables(with_labels=with_labels, with_replay=with_replay)
+                if settings is not None:
+                    replay_files.write_settings(folder, settings)
+                self._open_tables(with_labels=with_labels, with_replay=settings is not None)
         except WriterError:
             self.close()
             raise

@@ -14,7 +14,7 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
-from mavbridge.recording.replay_files import ReplaySettings, write_settings
+from mavbridge.recording.replay_files import ReplaySettings
 from mavbridge.recording.tlog import TlogPipe
 
 CAPACITY = 6000
@@ -54,19 +54,12 @@ class Recorder(ObserverThread):
         user, from the recorder's thread. Without ``settings`` nothing for a replay is kept.
 
         Raises:
-            OSError, WriterError: a file cannot be written, or the writer process does not start.
+            WriterError: a file cannot be written, or the writer process does not start.
         """
         self._folder = folder
-        is_replayed = settings is not None
         writer = FlightWriter(
-            folder, meta, pressure="online", with_replay=is_replayed, tlog_pipe=tlog_pipe
+            folder, meta, pressure="online", settings=settings, tlog_pipe=tlog_pipe
         )
-        if settings is not None:
-            try:
-                write_settings(folder, settings)
-            except OSError:
-                writer.close()
-                raise
         self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
         self.start(self._flight)
 

@@ -63,7 +63,8 @@ def comparable(solve: Solve) -> tuple[object, ...]:
 
 def record(folder: Path, **changes: Any) -> FlightWriter:
     with without_writer_process():
-        return FlightWriter(folder, make_meta(**changes), pressure="offline", with_replay=True)
+        settings = ReplaySettings(config=FlyConfig(), wall_offset_ns=1)
+        return FlightWriter(folder, make_meta(**changes), pressure="offline", settings=settings)
 
 
 @pytest.mark.parametrize("is_finished", [True, False])
