@@ -8,14 +8,13 @@ import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 
 import numpy as np
 import pyarrow as pa
 import torch
-from torch import Tensor
 
 from mavbridge.commands.imagine.loop import (
     RolloutError,
@@ -26,7 +25,6 @@ from mavbridge.commands.imagine.loop import (
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import HungError
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
@@ -90,14 +88,11 @@ class StreamedOutput:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
-        self._model = sampler.model
+        self._sampler = sampler
         self._frame_dt_s = sampler.config.frame_dt_s
         self._digest = hashlib.sha256()
         self.frames = 0
-        self._stream: torch.cuda.Stream | None = None
-        """On a GPU, the decoder's stream beside the sampler's."""
-        if (device := next(sampler.model.parameters()).device).type == "cuda":
-            self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        """Number of frames written; without a video, of rows."""
         self._table_path = out.with_suffix(".arrows")
         self.video: VideoWriter | None = None
         with writing(self._table_path):
@@ -121,12 +116,29 @@ class StreamedOutput:
         return self._digest.hexdigest()
 
     def put(self, segment: Segment) -> None:
-        """Hand over a segment; wait while ``QUEUED_SEGMENTS`` are waiting."""
-        ready = None
-        if self.video is not None and segment.latents.is_cuda:
-            ready = torch.cuda.current_stream(segment.latents.device).record_event()
+        """Write the rows of a segment, and hand over its images, once ``QUEUED_SEGMENTS`` wait.
+
+        After a crash there can be rows without a frame, but no frame without a row.
+        """
+        plan, first_step = self._plan, segment.iteration * self._plan.exe_steps + 1
         self._wait(QUEUED_SEGMENTS)
-        self._open.append(self._thread.submit(self._serve, segment, ready))
+        with writing(self._table_path):
+            for row in range(plan.frames):
+                self._table.add(
+                    {
+                        "iteration": segment.iteration,
+                        "frame": row,
+                        "executed": row < plan.exe_steps,
+                        "time_s": (first_step + row) * self._frame_dt_s,
+                        "state": segment.states[row],
+                        "action": segment.actions[row],
+                    }
+                )
+            self._table.flush()
+        if self.video is None:
+            self.frames = self._table.rows
+        else:
+            self._open.append(self._thread.submit(self._write_images, segment, self.video))
 
     def _wait(self, most: int, on_wait: Callable[[], None] = lambda: None) -> None:
         """Wait until at most ``most`` segments are open, as long as frames are finished.
@@ -164,54 +176,21 @@ class StreamedOutput:
             self.video.close()
         self._table.abandon()
 
-    def _serve(self, segment: Segment, ready: torch.cuda.Event | None) -> None:
-        """Write a segment, whose latents can be read after ``ready``; none after an error."""
+    def _write_images(self, segment: Segment, video: VideoWriter) -> None:
+        """Decode and write the images of a segment; none after an error."""
         try:
-            if not self._stop.is_set():
-                self._write(segment, ready)
+            for row in range(self._plan.frames):
+                if self._stop.is_set():
+                    return
+                rgb = segment.decoded.get(row)
+                if rgb is None:
+                    (rgb,) = self._sampler.decode(segment.latents[row, None])
+                number = segment.iteration * self._plan.frames + row
+                # Frames of the video are evenly spaced.
+                at_ns = round(number * self._frame_dt_s * NS_PER_S)
+                video.submit(rgb, FrameRow(frame_id=number, captured_ns=at_ns, ready_ns=at_ns))
+                self._digest.update(np.ascontiguousarray(rgb).data)
+                self.frames += 1
         except BaseException:
             self._stop.set()
             raise
-
-    def _write(self, segment: Segment, ready: torch.cuda.Event | None) -> None:
-        plan, first_step = self._plan, segment.iteration * self._plan.exe_steps + 1
-        # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
-        with writing(self._table_path):
-            for row in range(plan.frames):
-                self._table.add(
-                    {
-                        "iteration": segment.iteration,
-                        "frame": row,
-                        "executed": row < plan.exe_steps,
-                        "time_s": (first_step + row) * self._frame_dt_s,
-                        "state": segment.states[row],
-                        "action": segment.actions[row],
-                    }
-                )
-            self._table.flush()
-        for row in range(plan.frames):
-            if self._stop.is_set():
-                return
-            if self.video is not None:
-                rgb = segment.decoded.get(row)
-                if rgb is None:
-                    rgb = self._decode(segment.latents[row, None], ready)
-                number = segment.iteration * plan.frames + row
-                # Frames of the video are evenly spaced.
-                at_ns = round(number * self._frame_dt_s * NS_PER_S)
-                frame = FrameRow(frame_id=number, captured_ns=at_ns, ready_ns=at_ns)
-                self.video.submit(rgb, frame)
-                self._digest.update(np.ascontiguousarray(rgb).data)
-            self.frames += 1
-
-    def _decode(self, latents: Tensor, ready: torch.cuda.Event | None) -> ImageArray:
-        """Decode latents [1, C, h, w]; on a GPU they can be read after the event ``ready``."""
-        beside: AbstractContextManager[object] = nullcontext()
-        if self._stream is not None and ready is not None:
-            self._stream.wait_event(ready)
-            # Once the loop's stream frees the memory, it must not be reused before this one ends.
-            latents.record_stream(self._stream)
-            beside = torch.cuda.stream(self._stream)
-        with torch.inference_mode(), beside:
-            pixels: ImageArray = self._model.decode(latents)[0].cpu().numpy()
-        return pixels
