@@ -4,7 +4,7 @@
                                                                          |
                                       VideoWriter: frames through shared memory, rows by pipe
                                                                          v
-                                   writer process: FrameFiles --> camera.mp4, frames
+                                            writer process --> camera.mp4
     process of the link --open_tlog_pipe--> writer process: TlogThread --> link.tlog
 
 ``FlightWriter`` alone, in the offline mode, records flights that need not run in real time

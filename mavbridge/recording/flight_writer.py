@@ -23,7 +23,13 @@ from mavbridge.recording.folder import (
     write_meta,
 )
 from mavbridge.recording.replay_files import ReplaySettings
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
+from mavbridge.recording.rows import (
+    FrameRow,
+    FrameTruth,
+    TickRow,
+    frame_columns,
+    tick_columns,
+)
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogPipe
 from mavbridge.recording.video_process import VideoJob
@@ -55,7 +61,11 @@ class _Camera:
     """Name in file names; None for the first camera."""
     video: VideoWriter
     features: TableWriter | None = None
+    frames: TableWriter | None = None
+    """Created with the first frame."""
     serials: SerialNumbers = field(default_factory=SerialNumbers)
+    recorded: SerialNumbers = field(default_factory=SerialNumbers)
+    """Of all frames, and of those that the video has."""
     is_dead: bool = False
     """True if the writer process has died: its frames are lost."""
 
@@ -96,7 +106,7 @@ class FlightWriter:
         self._packet_serials, self._packets_dropped = SerialNumbers(), 0
         try:
             with self._writing():
-                self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
+                self._start_videos(pressure, tlog_pipe)
                 write_meta(folder, meta)
                 if settings is not None:
                     replay_files.write_settings(folder, settings)
@@ -105,22 +115,16 @@ class FlightWriter:
             self.close()
             raise
 
-    def _start_videos(
-        self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
-    ) -> None:
+    def _start_videos(self, pressure: Pressure, tlog_pipe: TlogPipe | None) -> None:
         tlog = None if tlog_pipe is None else tlog_pipe.reader
         for name in (None, *self.meta.contract.cameras[1:]):
-            job = VideoJob(
-                video=self._folder / video_of(name),
-                hz=self.meta.visual_hz,
-                rows=self._folder / frames_of(name),
-                with_truth=with_truth,
-                tlog=tlog if name is None else None,
-            )
+            of_first = tlog if name is None else None
+            job = VideoJob(self._folder / video_of(name), self.meta.visual_hz, of_first)
             self._cameras.append(_Camera(name, VideoWriter(job, pressure=pressure)))
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
         self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
+        self._frames_schema = rows.DEMONSTRATION_FRAMES if with_labels else rows.FRAMES
         self._solves = self._table(SOLVES, replay_files.SOLVES) if with_replay else None
         self._packets = self._table(PACKETS, replay_files.PACKETS) if with_replay else None
         if with_replay and self.meta.mode == "dual":  # else features are only resized images
@@ -147,24 +151,29 @@ class FlightWriter:
         if camera.features is not None and vision.feature is not None:
             camera.features.add(replay_files.feature_columns(vision, vision.feature, dropped))
         self._flush_if_due(vision.ready_ns)
+        if not self._act(camera, lambda video: video.submit(vision.rgb, vision.captured_ns)):
+            return
+        if camera.frames is None:
+            with self._writing():
+                camera.frames = self._table(frames_of(camera.name), self._frames_schema)
         row = FrameRow(
             frame_id=vision.frame_id,
             captured_ns=vision.captured_ns,
             ready_ns=vision.ready_ns,
-            dropped_before=dropped,
+            dropped_before=camera.recorded.take(vision.serial),
             truth=truth,
         )
-        self._act(camera, lambda video: video.submit(vision.rgb, row))
+        camera.frames.add(frame_columns(row))
 
-    def _act(self, camera: _Camera, act: Callable[[VideoWriter], object]) -> None:
-        """Use the writer of a camera; its death loses only its frames."""
-        if camera.is_dead:
-            return
-        try:
-            act(camera.video)
-        except WriterDiedError as error:
-            camera.is_dead = True
-            self.video_failure = self.video_failure or error
+    def _act(self, camera: _Camera, act: Callable[[VideoWriter], bool | None]) -> bool | None:
+        """Use the writer of a camera; its death, which loses only its frames, returns None."""
+        if not camera.is_dead:
+            try:
+                return act(camera.video)
+            except WriterDiedError as error:
+                camera.is_dead = True
+                self.video_failure = self.video_failure or error
+        return None
 
     def solve(self, solve: Solve) -> None:
         """Record a solve for a replay. Skipped serial numbers count as dropped."""

@@ -39,50 +39,54 @@ _BUFFER_BYTES = 1 << 20
 class FragmentedMp4:
     """Video file that grows frame by frame. Methods can raise ``WRITE_ERRORS``."""
 
-    def __init__(
-        self, path: Path, *, height: int, width: int, hz: float, is_depth: bool = False
-    ) -> None:
-        """Create the file, which must not exist, for frames with even sides.
+    def __init__(self, path: Path, hz: float) -> None:
+        """Write to ``path``, created with the first frame, which gives the size and the kind.
 
         ``hz`` is the nominal frame rate; the stamps of the frames decide.
         """
-        self._file: BinaryIO = path.open("xb", buffering=_BUFFER_BYTES)
-        self._container: OutputContainer = av.open(
-            self._file, "w", format="mp4", options=_FRAGMENTED
-        )
-        rate = Fraction(hz).limit_denominator(1000)
-        if is_depth:
-            stream = self._container.add_stream("ffv1", rate)
-            stream.options = {"g": "1"}  # each image separately
-        else:
-            stream = self._container.add_stream("libx264", rate)
-            stream.options = _OPTIONS
-        stream.height, stream.width = height, width
-        stream.pix_fmt = _DEPTH if is_depth else "yuv420p"
-        stream.codec_context.time_base = TIME_BASE
-        self._stream = stream
+        self._path, self._hz = path, hz
+        self._file: BinaryIO | None = None
         self._first_ns: int | None = None
         self._last_pts = -1
 
-    def append(self, rgb: CameraImage, captured_ns: int) -> None:
-        """Encode one frame and hand it to the kernel.
+    def _open(self, image: CameraImage) -> BinaryIO:
+        self._file = file = self._path.open("xb", buffering=_BUFFER_BYTES)
+        self._container: OutputContainer = av.open(file, "w", format="mp4", options=_FRAGMENTED)
+        rate = Fraction(self._hz).limit_denominator(1000)
+        if image.ndim == 2:  # depth
+            self._stream = self._container.add_stream("ffv1", rate)
+            self._stream.options = {"g": "1"}  # each image separately
+        else:
+            self._stream = self._container.add_stream("libx264", rate)
+            self._stream.options = _OPTIONS
+        self._stream.height, self._stream.width = image.shape[:2]
+        self._stream.pix_fmt = _DEPTH if image.ndim == 2 else "yuv420p"
+        self._stream.codec_context.time_base = TIME_BASE
+        return file
+
+    def append(self, image: CameraImage, captured_ns: int) -> None:
+        """Encode one frame with even sides and hand it to the kernel.
 
         A stamp not later than the last frame's is moved behind it.
         """
+        file = self._file or self._open(image)
         if self._first_ns is None:
             self._first_ns = captured_ns
         pts = max(self._last_pts + 1, (captured_ns - self._first_ns) * 9 // 100_000)
-        pixels: Any = rgb
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24" if rgb.ndim == 3 else _DEPTH)
+        pixels: Any = image
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24" if image.ndim == 3 else _DEPTH)
         frame.pts, frame.time_base = pts, TIME_BASE
         self._container.mux(self._stream.encode(frame))
-        self._file.flush()
+        file.flush()
         self._last_pts = pts
 
     def close(self) -> None:
-        """Write the remaining data and close the file, also after an error."""
+        """Write the remaining data and close the file, also after an error. Can be called twice."""
+        file, self._file = self._file, None
+        if file is None:
+            return
         try:
             self._container.mux(self._stream.encode(None))
             self._container.close()
         finally:
-            self._file.close()
+            file.close()

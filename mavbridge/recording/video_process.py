@@ -1,4 +1,4 @@
-"""Process that encodes frames into a video and its table, and keeps the log of the link.
+"""Process that encodes frames into a video, and keeps the log of the link.
 
 It ends by itself with all files closed, even if its producer is killed: the pipe then ends. The log
 has a separate pipe from another process, and the end of that pipe is awaited last. The producer
@@ -25,12 +25,9 @@ import numpy as np
 
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.folder import TLOG
-from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, frame_columns
-from mavbridge.recording.tables import FLUSH_NS, READ_ERRORS, TableWriter
 from mavbridge.recording.tlog import TlogThread
 from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 
-FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
 MAX_SLOTS = 32
 MIN_SLOTS = 4
 MAX_BYTES = 32 << 20
@@ -103,72 +100,12 @@ class VideoJob(NamedTuple):
     """Fragmented MP4; must not exist."""
     hz: float
     """Nominal frame rate."""
-    rows: Path | None = None
-    """Path and stem of the frames table; None: only a video."""
-    with_truth: bool = False
-    """The table has the columns of ``FrameTruth``."""
     tlog: "Connection[Never, Never] | None" = None
     """Records of the link's log, which is written beside the video."""
 
 
-class FrameFiles:
-    """Files of one job, created with the first frame, whose size is that of the video.
-
-    Every method can raise one of ``FILE_ERRORS``; afterwards only ``abandon`` is allowed.
-    """
-
-    def __init__(self, job: VideoJob) -> None:
-        self._job = job
-        self._video: FragmentedMp4 | None = None
-        self._table: TableWriter | None = None
-        self._flushed_ns = 0
-
-    def append(self, rgb: CameraImage, row: FrameRow) -> None:
-        """Write a frame with even sides. Its row follows within half a second."""
-        job = self._job
-        if self._video is None:
-            height, width = rgb.shape[:2]
-            self._video = FragmentedMp4(
-                job.video, height=height, width=width, hz=job.hz, is_depth=rgb.ndim == 2
-            )
-        self._video.append(rgb, row.captured_ns)
-        if job.rows is None:
-            return
-        if self._table is None:
-            self._table = TableWriter(job.rows, DEMONSTRATION_FRAMES if job.with_truth else FRAMES)
-        self._table.add(frame_columns(row))
-        if row.captured_ns - self._flushed_ns >= FLUSH_NS:
-            self._flushed_ns = row.captured_ns
-            self.flush()
-
-    def flush(self) -> None:
-        """Write the pending rows."""
-        if self._table is not None:
-            self._table.flush()
-
-    def finish(self) -> None:
-        """Close both files in order."""
-        self._close_video()
-        if self._table is not None:
-            table, self._table = self._table, None
-            table.finish()
-
-    def abandon(self) -> None:
-        """Leave the written data; a failed file can be cut off at its end. Never raises."""
-        for close in (self._close_video, self.flush):
-            with suppress(*FILE_ERRORS):  # a disk that was full is still full
-                close()
-        if self._table is not None:
-            self._table.abandon()
-
-    def _close_video(self) -> None:
-        if self._video is not None:
-            video, self._video = self._video, None
-            video.close()
-
-
-IDLE_S = 0.5
-"""Longest wait of pending rows for the next frame."""
+POLL_S = 0.5
+"""Longest time until a failure of the log is told."""
 TLOG_S = 60.0
 """Longest wait for the end of the log once the producer is gone: the link's process still has to
 bring the vehicle to safety."""
@@ -179,7 +116,7 @@ class Submit(NamedTuple):
     """Message to the writer: this slot holds a frame."""
 
     slot: int
-    row: FrameRow
+    captured_ns: int
 
 
 class Written(NamedTuple):
@@ -221,7 +158,7 @@ def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness
     service = WriterService(pipe, job, tlog)
     service.send(Notice.READY)
     while service.is_open:
-        service.serve(IDLE_S)
+        service.serve(POLL_S)
     if tlog is not None:
         tlog.finish(0.0 if service.has_failed else TLOG_S)
 
@@ -237,7 +174,7 @@ class WriterService:
     ) -> None:
         self._pipe = pipe
         self._tlog = tlog
-        self._files = FrameFiles(job)
+        self._video = FragmentedMp4(job.video, job.hz)
         self._folder = job.video.parent
         self._slots: CameraImage | None = None
         self.is_open = True
@@ -257,17 +194,16 @@ class WriterService:
             return
         try:
             if not self._pipe.poll(timeout_s):
-                self._files.flush()
                 return
             match self._receive():
-                case Submit(slot=slot, row=row) if self._slots is not None:
-                    self._files.append(self._slots[slot], row)
+                case Submit(slot=slot, captured_ns=captured_ns) if self._slots is not None:
+                    self._video.append(self._slots[slot], captured_ns)
                     self.send(Written(slot))
                 case Notice.FINISH:
-                    self._files.finish()
+                    self._video.close()
                     self.is_open = False
                     self.send(Notice.DONE)
-        except FILE_ERRORS as error:
+        except WRITE_ERRORS as error:
             self._fail("video", error)
 
     def _receive(self) -> ToWriter:
@@ -282,7 +218,8 @@ class WriterService:
 
     def _fail(self, what: str, error: Exception) -> None:
         self.has_failed = True
-        self._files.abandon()
+        with suppress(*WRITE_ERRORS):  # a disk that was full is still full
+            self._video.close()
         self.is_open = False
         reason = getattr(error, "strerror", None) or error
         self.send(Failed(f"the {what} cannot be written: {self._folder}: {reason}"))

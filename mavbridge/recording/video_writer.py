@@ -5,14 +5,12 @@ import os
 import weakref
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Literal
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
-from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.video_process import (
     NICENESS,
     Failed,
@@ -66,7 +64,6 @@ class VideoWriter:
         """Memory for frames; None before the first and after ``close``."""
         self._free: deque[int] = deque()
         self._failure: WriterError | None = None
-        self._pending_drops = 0
         self._notices: set[Notice] = set()
         self.misfit: str | None = None
         """Why a frame was dropped that the video cannot have; None if there was none."""
@@ -84,15 +81,15 @@ class VideoWriter:
             self.close()
             raise
 
-    def submit(self, rgb: CameraImage, row: FrameRow) -> None:
-        """Hand a frame over; the caller can overwrite it afterwards.
+    def submit(self, rgb: CameraImage, captured_ns: int) -> bool:
+        """Hand a frame over; the caller can overwrite it afterwards. False: it was dropped.
 
         A frame that differs in size or kind from the first, or is one pixel high or wide, is a bug
-        offline; online, it is dropped and counted: see ``misfit``.
+        offline; online, it is dropped: see ``misfit``.
 
         Args:
             rgb: the image. An odd last row or column is cut off, which H.264 cannot have.
-            row: other facts about the frame; drops of the ring are added to ``dropped_before``.
+            captured_ns: its exposure.
         """
         self._receive()
         height, width = rgb.shape[:2]
@@ -106,12 +103,11 @@ class VideoWriter:
         elif self._pressure == "offline":
             self._wait_until(lambda: bool(self._free))
         if slots is None or not self._free:
-            self._pending_drops += 1 + row.dropped_before
-            return
+            return False
         slot = self._free.popleft()
         slots[slot] = rgb
-        dropped, self._pending_drops = row.dropped_before + self._pending_drops, 0
-        self._send(Submit(slot, replace(row, dropped_before=dropped)))
+        self._send(Submit(slot, captured_ns))
+        return True
 
     def _see_misfit(self, height: int, width: int) -> None:
         if self._slots is None:

@@ -18,7 +18,8 @@ from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video_process import FrameFiles, VideoJob
+from mavbridge.recording.video_file import FragmentedMp4
+from mavbridge.recording.video_process import VideoJob
 from policy.contract import Contract
 from policy.data.flight_video import decode_images, video_parts
 
@@ -87,22 +88,20 @@ class InProcessWriter:
     def __init__(self, job: VideoJob, *, pressure: str) -> None:
         if job.tlog is not None:
             job.tlog.close()
-        self._files = FrameFiles(job)
-        self._is_open = True
+        self._video = FragmentedMp4(job.video, job.hz)
         self.written = 0
 
-    def submit(self, rgb: ImageArray, row: FrameRow) -> None:
+    def submit(self, rgb: CameraImage, captured_ns: int) -> bool:
         height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
-        self._files.append(rgb[:height, :width], row)
+        self._video.append(rgb[:height, :width], captured_ns)
         self.written += 1
+        return True
 
     def finish(self) -> None:
         self.close()
 
     def close(self) -> None:
-        if self._is_open:
-            self._is_open = False
-            self._files.finish()
+        self._video.close()
 
 
 @contextmanager

@@ -26,7 +26,6 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import HungError
-from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video_file import WRITE_ERRORS
 from mavbridge.recording.video_process import VideoJob
@@ -188,7 +187,7 @@ class StreamedOutput:
                 number = segment.iteration * self._plan.frames + row
                 # Frames of the video are evenly spaced.
                 at_ns = round(number * self._frame_dt_s * NS_PER_S)
-                video.submit(rgb, FrameRow(frame_id=number, captured_ns=at_ns, ready_ns=at_ns))
+                video.submit(rgb, at_ns)
                 self._digest.update(np.ascontiguousarray(rgb).data)
                 self.frames += 1
         except BaseException:

@@ -143,7 +143,7 @@ def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth, clock)
 
 def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path, clock):
     path = tmp_path / "camera.mp4"
-    video = FragmentedMp4(path, height=SIDE, width=SIDE, hz=30, is_depth=True)
+    video = FragmentedMp4(path, hz=30)
     for number in range(3):
         video.append(depth_scene(number), number * NS_PER_S // 30)
     video.close()

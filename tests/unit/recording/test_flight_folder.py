@@ -9,10 +9,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
-from helpers.recordings import disk_of, make_frame, make_meta, number_of, write_recording
+from helpers.recordings import (
+    InProcessWriter,
+    disk_of,
+    make_frame,
+    make_meta,
+    number_of,
+    write_recording,
+)
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import FlightOutcome, Tick, VisionTick
+from mavbridge.core.records import FlightOutcome, ImageArray, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import FlightError, prepare_folder, read_meta, write_meta
@@ -76,6 +83,22 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
     ]
     with pytest.raises(FlightError, match="has no camera left: it has front, down"):
         open_flight(folder, "left")
+
+
+def test_a_frame_that_the_video_does_not_take_is_told_by_the_next_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit = InProcessWriter.submit
+
+    def take_some(self: InProcessWriter, rgb: ImageArray, captured_ns: int) -> bool:
+        return number_of(rgb) not in (0, 3, 4, 9) and submit(self, rgb, captured_ns)
+
+    monkeypatch.setattr(InProcessWriter, "submit", take_some)
+    recorded = [make_frame(number, serial=number + (number > 5)) for number in range(10)]
+    back = open_flight(write_recording(tmp_path / "flight", recorded))
+    assert [row.frame_id - 1 for row in back.frame_rows()] == [1, 2, 5, 6, 7, 8]
+    assert [row.dropped_before for row in back.frame_rows()] == [1, 0, 2, 1, 0, 0]
+    assert (back.meta.frames, back.meta.frames_dropped) == (6, 4 + 1)
 
 
 def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.recordings import count_frames, make_row, picture
+from helpers.recordings import count_frames, picture
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.tlog import TlogPipe, TlogThread, open_tlog_pipe
 from mavbridge.recording.video_process import VideoJob
@@ -86,7 +86,7 @@ def test_the_log_goes_on_after_the_recording_was_finished(
 ) -> None:
     send(link, 10)
     for k in range(5):
-        video.submit(picture(k), make_row(k))
+        video.submit(picture(k), k)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
         os.kill(video._process.pid, number)
     video.finish()

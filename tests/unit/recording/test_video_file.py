@@ -1,6 +1,5 @@
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from helpers.factories import FRAME_NS, START_NS
 from helpers.recordings import count_frames, number_of, picture, read_video
-from mavbridge.core.records import ImageArray
+from mavbridge.core.records import CameraImage
 from mavbridge.recording.video_file import FragmentedMp4
 from policy.data.flight_data import DatasetError
 from policy.data.flight_video import decode_images, decode_video, video_parts
@@ -19,11 +18,10 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "camera.mp4"
 
 
-def write(path: Path, images: Iterable[ImageArray], **changes: Any) -> None:
+def write(path: Path, images: Iterable[CameraImage]) -> None:
     """30 images a second; each can be read once the next has come."""
-    first, *others = images
-    video = FragmentedMp4(path, height=first.shape[0], width=first.shape[1], hz=30, **changes)
-    for k, image in enumerate([first, *others]):
+    video = FragmentedMp4(path, hz=30)
+    for k, image in enumerate(images):
         video.append(image, START_NS + k * FRAME_NS)
         assert count_frames(path) == k
     video.close()
@@ -106,12 +104,12 @@ def test_errors_say_what_is_wrong(path: Path) -> None:
     with pytest.raises(DatasetError, match="2 of 5 images are missing"):
         list(decode_images(path, range(5)))
     with pytest.raises(FileExistsError):
-        FragmentedMp4(path, height=48, width=64, hz=30)
+        FragmentedMp4(path, hz=30).append(picture(0), START_NS)
 
 
 def test_depth_comes_back_to_the_last_bit(path: Path) -> None:
     depths = np.random.default_rng(0).integers(0, 1 << 16, (4, 48, 64), np.uint16)
-    write(path, depths, is_depth=True)
+    write(path, depths)
     back = list(read_video(path))
     assert {each.dtype for each in back} == {np.dtype(np.uint16)}
     assert np.array_equal(back, depths)
@@ -120,7 +118,7 @@ def test_depth_comes_back_to_the_last_bit(path: Path) -> None:
 
 
 def test_stamps_that_stand_still_or_go_back_still_give_frames(path: Path) -> None:
-    video = FragmentedMp4(path, height=48, width=64, hz=30)
+    video = FragmentedMp4(path, hz=30)
     for k, at_ns in enumerate((0, 0, -5 * FRAME_NS, FRAME_NS, 0)):
         video.append(picture(k), START_NS + at_ns)
     video.close()

@@ -15,16 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.recordings import (
-    count_frames,
-    make_row,
     number_of,
     picture,
     read_video,
     send_signal,
 )
 from mavbridge.recording import video_process, video_writer
-from mavbridge.recording.rows import FRAMES, read_frames
-from mavbridge.recording.tables import read_table
 from mavbridge.recording.video_process import (
     MAX_BYTES,
     MAX_SLOTS,
@@ -41,21 +37,20 @@ DEADLINE_S = 30.0
 
 
 def writer(folder: Path, pressure: Pressure) -> closing[VideoWriter]:
-    job = VideoJob(folder / "camera.mp4", hz=30, rows=folder / "frames")
+    job = VideoJob(folder / "camera.mp4", hz=30)
     return closing(VideoWriter(job, pressure=pressure))
 
 
-def read_back(folder: Path) -> tuple[list[int], list[int]]:
-    """Numbers of the images, and of their rows."""
-    rows = read_table(folder / "frames", FRAMES)["frame_id"].to_pylist()
-    return [number_of(rgb) for rgb in read_video(folder / "camera.mp4")], rows
+def read_back(path: Path) -> list[int]:
+    """Numbers of the images."""
+    return [number_of(rgb) for rgb in read_video(path)]
 
 
-def test_a_video_alone_needs_no_table_and_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
+def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
     job = VideoJob(tmp_path / "odd.mp4", hz=10)
     with closing(VideoWriter(job, pressure="offline")) as video:
         for k in range(3):
-            video.submit(picture(k, height=49, width=67), make_row(k))
+            assert video.submit(picture(k, height=49, width=67), k)
         video.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["odd.mp4"]
     images = list(read_video(tmp_path / "odd.mp4"))
@@ -72,14 +67,14 @@ def test_a_pause_of_both_processes_is_no_hang(tmp_path: Path) -> None:
         patch.object(video_writer, "wait", paused_once),
         writer(tmp_path, "offline") as video,
     ):
-        video.submit(picture(0), make_row(0))
+        video.submit(picture(0), 0)
         video.finish()
-    assert read_back(tmp_path) == ([0], [0])
+    assert read_back(tmp_path / "camera.mp4") == [0]
 
 
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
     with writer(tmp_path, "offline") as video:
-        video.submit(picture(0), make_row(0))
+        video.submit(picture(0), 0)
         send_signal(video._process.pid, signal.SIGSTOP)
         reasons: list[str] = []
         has_begun = threading.Event()
@@ -87,7 +82,7 @@ def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> No
         def produce() -> None:
             try:
                 for k in range(1, 100):
-                    video.submit(picture(k), make_row(k))
+                    video.submit(picture(k), k)
                     has_begun.set()
             except WriterError as error:
                 reasons.append(str(error))
@@ -114,45 +109,32 @@ class Alive:
 
 
 @settings(max_examples=40)
-@given(st.lists(st.integers(0, 3), max_size=60))
-def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
-    """0..2: a frame is offered, with so many lost before it; 3: the writer does one thing."""
+@given(st.lists(st.booleans(), max_size=60))
+def test_the_video_has_the_frames_that_were_taken(steps: list[bool]) -> None:
+    """True: a frame is offered; False: the writer does one thing."""
     with TemporaryDirectory() as name, patch.object(video_process, "MAX_SLOTS", MIN_SLOTS):
-        folder = Path(name)
-        video, table = folder / "camera.mp4", folder / "frames"
+        video = Path(name) / "camera.mp4"
         ours, its = Pipe()
-        job = VideoJob(video, hz=30, rows=table)
+        job = VideoJob(video, hz=30)
         service = WriterService(its, job)
         service.send(Notice.READY)
         with patch.object(video_writer, "start_process", lambda *_: (ours, Alive())):
             sender = VideoWriter(job, pressure="online")
-        offered = lost_upstream = 0
         taken: list[int] = []
-        for step in steps:
-            if step == 3:
-                if its.poll():
-                    service.serve(0)
-                continue
-            lost_upstream += step
-            sender.submit(picture(offered), make_row(offered, dropped_before=step))
-            if sender._pending_drops == 0:
-                taken.append(offered)
-                lost_upstream_taken = lost_upstream
-            offered += 1
+        for number, is_offered in enumerate(steps):
+            if not is_offered:
+                service.serve(0)
+            elif sender.submit(picture(number), number):
+                taken.append(number)
         ours.send(Notice.FINISH)
         while service.is_open:
             service.serve(0)
         sender._receive()
         sender.close()
         its.close()
-        if not taken:
-            return
-        rows = list(read_frames(read_table(table, FRAMES)))
-        assert [row.frame_id for row in rows] == taken
-        assert count_frames(video) == len(rows)
-        dropped = sum(row.dropped_before for row in rows)
-        assert dropped == lost_upstream_taken + taken[-1] + 1 - len(taken)
-        assert sender.written == len(rows)
+        assert sender.written == len(taken)
+        assert video.exists() == bool(taken)
+        assert not taken or read_back(video) == taken
 
 
 @pytest.mark.parametrize(("side", "slots"), [(224, MAX_SLOTS), (1080, 9), (3000, MIN_SLOTS)])
