@@ -8,6 +8,6 @@
     process of the link --open_tlog_pipe--> writer process: TlogThread --> link.tlog
 
 ``FlightWriter`` alone, in the offline mode, records flights that need not run in real time
-(demonstrations). ``VideoWriter`` alone makes one video of frames from any source (rollouts).
-``open_flight`` reads a recording back, also after a crash. The loops do not import this package.
+(demonstrations). ``open_flight`` reads a recording back, also after a crash. The loops do not
+import this package.
 """

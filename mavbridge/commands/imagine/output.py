@@ -1,14 +1,14 @@
 """Writer of a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row per frame.
 
 While it grows, and after a crash, the table is ``NAME.arrows``, as with recorded flights. A thread
-decodes, the writer process writes.
+decodes and encodes the images.
 """
 
 import hashlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event
 
@@ -27,9 +27,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video_file import WRITE_ERRORS
-from mavbridge.recording.video_process import VideoJob
-from mavbridge.recording.video_writer import VideoWriter
+from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 from policy.contract import ACTION_DIM, STATE_DIM
 
 SCHEMA = pa.schema(
@@ -70,8 +68,8 @@ QUEUED_SEGMENTS = 2
 the pace."""
 STALL_S = 120.0
 """Longest time without a finished frame."""
-END_S = 45.0
-"""Longer than the timeout for a hung writer process."""
+END_S = 10.0
+"""Longest wait at the end for the image in hand."""
 _POLL_S = 0.1
 
 
@@ -92,16 +90,10 @@ class StreamedOutput:
         self._digest = hashlib.sha256()
         self.frames = 0
         """Number of frames written; without a video, of rows."""
+        self._video = FragmentedMp4(out, 1 / self._frame_dt_s) if decode_video else None
         self._table_path = out.with_suffix(".arrows")
-        self.video: VideoWriter | None = None
         with writing(self._table_path):
             self._table = TableWriter(out, SCHEMA)
-        if decode_video:
-            try:
-                self.video = VideoWriter(VideoJob(out, 1 / self._frame_dt_s), pressure="offline")
-            except BaseException:
-                self._table.abandon()
-                raise
         self._stop = Event()
         self._open: deque[Future[None]] = deque()
         """Segments that are not written yet."""
@@ -134,10 +126,10 @@ class StreamedOutput:
                     }
                 )
             self._table.flush()
-        if self.video is None:
+        if self._video is None:
             self.frames = self._table.rows
         else:
-            self._open.append(self._thread.submit(self._write_images, segment, self.video))
+            self._open.append(self._thread.submit(self._write_images, segment, self._video))
 
     def _wait(self, most: int, on_wait: Callable[[], None] = lambda: None) -> None:
         """Wait until at most ``most`` segments are open, as long as frames are finished.
@@ -155,27 +147,25 @@ class StreamedOutput:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Write all segments, close the files, and compare their lengths."""
+        """Write all segments, and close the files."""
         self._wait(0, on_wait)
-        if self.video is not None:
-            self.video.finish()
-            if self.video.written != self._table.rows:
-                raise RolloutError(
-                    f"{self.video.written} frames were written for {self._table.rows} rows"
-                )
+        if self._video is not None:
+            with writing(self.out):
+                self._video.close()
         with writing(self._table_path):
             self._table.finish()
 
     def close(self) -> None:
-        """Stop the thread and the writer, if ``finish`` did not; what is written stays readable."""
+        """Stop the thread, if ``finish`` did not; what is written stays readable."""
         self._stop.set()
         is_hung = bool(wait(self._open, END_S).not_done)
         self._thread.shutdown(wait=not is_hung)
-        if self.video is not None:
-            self.video.close()
+        if self._video is not None and not is_hung:
+            with suppress(*WRITE_ERRORS):  # a disk that was full is still full
+                self._video.close()
         self._table.abandon()
 
-    def _write_images(self, segment: Segment, video: VideoWriter) -> None:
+    def _write_images(self, segment: Segment, video: FragmentedMp4) -> None:
         """Decode and write the images of a segment; none after an error."""
         try:
             for row in range(self._plan.frames):
@@ -187,7 +177,8 @@ class StreamedOutput:
                 number = segment.iteration * self._plan.frames + row
                 # Frames of the video are evenly spaced.
                 at_ns = round(number * self._frame_dt_s * NS_PER_S)
-                video.submit(rgb, at_ns)
+                with writing(self.out):
+                    video.append(rgb, at_ns)
                 self._digest.update(np.ascontiguousarray(rgb).data)
                 self.frames += 1
         except BaseException:
