@@ -5,7 +5,7 @@
                                       VideoWriter: frames through shared memory, rows by pipe
                                                                          v
                                             writer process --> camera.mp4
-    process of the link --open_tlog_pipe--> writer process: TlogThread --> link.tlog
+    process of the link --open_tlog_pipe--> writer process --> link.tlog
 
 ``FlightWriter`` alone, in the offline mode, records flights that need not run in real time
 (demonstrations). ``open_flight`` reads a recording back, also after a crash. The loops do not

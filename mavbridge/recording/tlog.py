@@ -5,15 +5,11 @@ died. ``mavbridge.mavlink.codec.tlog`` makes them.
 """
 
 import os
-import threading
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Never
+from typing import NamedTuple, Never
 
-PERIOD_S = 0.05
-"""Time between two reads. Waking the reader for each record would cost the link's process time."""
 READ_BYTES = 1 << 16
-STOP_S = 1.0
 
 
 class TlogPipe(NamedTuple):
@@ -36,37 +32,19 @@ def open_tlog_pipe() -> TlogPipe:
     return TlogPipe(*Pipe(duplex=False))
 
 
-class TlogThread:
-    """Thread that copies the pipe to the file until the pipe ends."""
+class TlogFile:
+    """The file, which grows by what has come through the pipe."""
 
     def __init__(self, path: Path, records: "Connection[Never, Never]") -> None:
-        """Start the thread, which alone uses the pipe from here on. No file may be at ``path``."""
+        """Append to ``path``. Nobody else uses the pipe from here on."""
         self._path, self._records = path, records
-        self._stop = threading.Event()
-        self.failure: OSError | None = None
-        """Why the log is no longer written; the pipe is then closed."""
-        self._thread = threading.Thread(target=self._run, name="mavbridge-tlog", daemon=True)
-        self._thread.start()
+        self.has_ended = False
+        """True at the end of the pipe."""
 
-    def _run(self) -> None:
-        try:
-            with self._records, self._path.open("xb") as file:
-                while not self._stop.is_set() and self._copy(file):
-                    self._stop.wait(PERIOD_S)
-        except OSError as error:
-            self.failure = error
-
-    def _copy(self, file: BinaryIO) -> bool:
-        """Append the pending data of the pipe; return False at its end."""
-        if not wait([self._records], PERIOD_S):
-            return True
-        data = os.read(self._records.fileno(), READ_BYTES)
-        file.write(data)
-        file.flush()
-        return bool(data)
-
-    def finish(self, timeout_s: float) -> None:
-        """Wait at most ``timeout_s`` for the end of the pipe, and end the thread."""
-        self._thread.join(timeout_s)
-        self._stop.set()
-        self._thread.join(STOP_S)  # a hung disk must not keep the process alive
+    def copy(self) -> None:
+        """Append the pending data of the pipe; raise OSError if they cannot be written."""
+        with self._path.open("ab") as file:
+            while not self.has_ended and wait([self._records], 0):
+                data = os.read(self._records.fileno(), READ_BYTES)
+                file.write(data)
+                self.has_ended = not data

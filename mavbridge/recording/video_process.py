@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import tempfile
+import threading
 from contextlib import suppress
 from enum import Enum, auto
 from multiprocessing.connection import Connection
@@ -25,7 +26,7 @@ import numpy as np
 
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.folder import TLOG
-from mavbridge.recording.tlog import TlogThread
+from mavbridge.recording.tlog import TlogFile
 from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 
 MAX_SLOTS = 32
@@ -104,8 +105,8 @@ class VideoJob(NamedTuple):
     """Records of the link's log, which is written beside the video."""
 
 
-POLL_S = 0.5
-"""Longest time until a failure of the log is told."""
+PERIOD_S = 0.05
+"""Time between two reads of the log. Waking at each record would cost the link's process time."""
 TLOG_S = 60.0
 """Longest wait for the end of the log once the producer is gone: the link's process still has to
 bring the vehicle to safety."""
@@ -154,31 +155,23 @@ def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     os.nice(niceness)
-    tlog = None if job.tlog is None else TlogThread(job.video.with_name(TLOG), job.tlog)
-    service = WriterService(pipe, job, tlog)
+    service = WriterService(pipe, job)
     service.send(Notice.READY)
     while service.is_open:
-        service.serve(POLL_S)
-    if tlog is not None:
-        tlog.finish(0.0 if service.has_failed else TLOG_S)
+        service.serve(PERIOD_S)
+    service.finish_log()
 
 
 class WriterService:
     """Writer of one job, message by message."""
 
-    def __init__(
-        self,
-        pipe: "Connection[FromWriter, ToWriter]",
-        job: VideoJob,
-        tlog: TlogThread | None = None,
-    ) -> None:
+    def __init__(self, pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
         self._pipe = pipe
-        self._tlog = tlog
+        self._tlog = None if job.tlog is None else TlogFile(job.video.with_name(TLOG), job.tlog)
         self._video = FragmentedMp4(job.video, job.hz)
         self._folder = job.video.parent
         self._slots: CameraImage | None = None
         self.is_open = True
-        self.has_failed = False
 
     def send(self, message: FromWriter) -> None:
         """Send a message if the producer is still there."""
@@ -188,11 +181,12 @@ class WriterService:
             return
 
     def serve(self, timeout_s: float) -> None:
-        """Wait for one message and handle it."""
-        if self._tlog is not None and self._tlog.failure is not None:
-            self._fail("log of the link", self._tlog.failure)
-            return
+        """Copy the log, then wait for one message and handle it."""
+        what = "log of the link"
         try:
+            if self._tlog is not None:
+                self._tlog.copy()
+            what = "video"
             if not self._pipe.poll(timeout_s):
                 return
             match self._receive():
@@ -204,7 +198,16 @@ class WriterService:
                     self.is_open = False
                     self.send(Notice.DONE)
         except WRITE_ERRORS as error:
-            self._fail("video", error)
+            self._fail(what, error)
+
+    def finish_log(self) -> None:
+        """Copy the log to its end, for ``TLOG_S`` at most; after an error, leave it."""
+        with suppress(OSError):
+            for _ in range(round(TLOG_S / PERIOD_S)):
+                if self._tlog is None or self._tlog.has_ended:
+                    return
+                self._tlog.copy()
+                threading.Event().wait(PERIOD_S)
 
     def _receive(self) -> ToWriter:
         """Return the next message, or ``FINISH`` if the producer is gone; open the ring."""
@@ -217,7 +220,7 @@ class WriterService:
         return message
 
     def _fail(self, what: str, error: Exception) -> None:
-        self.has_failed = True
+        self._tlog = None
         with suppress(*WRITE_ERRORS):  # a disk that was full is still full
             self._video.close()
         self.is_open = False

@@ -4,6 +4,7 @@ import os
 import resource
 import signal
 from collections.abc import Iterator
+from multiprocessing import Pipe
 from multiprocessing.connection import wait
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 
 from helpers.recordings import count_frames, picture
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.recording.tlog import TlogPipe, TlogThread, open_tlog_pipe
-from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording import video_process
+from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
+from mavbridge.recording.video_process import VideoJob, WriterService
 from mavbridge.recording.video_writer import VideoWriter, WriterError
 
 DEADLINE_S = 30.0
@@ -53,23 +55,19 @@ def send(link: PacketPipe, count: int) -> None:
         link.put(k * 1000, b"%05d" % k)
 
 
-@pytest.mark.parametrize(
-    ("name", "deadline_s", "failure"),
-    [("link.tlog", 0.0, None), ("missing/link.tlog", DEADLINE_S, FileNotFoundError)],
-)
-def test_a_pipe_that_does_not_end_or_cannot_be_written_is_left(
-    tmp_path: Path,
-    pipe: TlogPipe,
-    link: PacketPipe,
-    name: str,
-    deadline_s: float,
-    failure: type[Exception] | None,
+def test_a_log_without_an_end_is_left(
+    tmp_path: Path, pipe: TlogPipe, link: PacketPipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thread = TlogThread(tmp_path / name, pipe.reader)
-    thread.finish(deadline_s)
-    assert thread.failure is None if failure is None else isinstance(thread.failure, failure)
+    monkeypatch.setattr(video_process, "TLOG_S", 0.1)
     send(link, 2)
-    assert link.dropped == 2, "the link learns that nobody reads"
+    ours, its = Pipe()
+    ours.close()
+    service = WriterService(its, VideoJob(tmp_path / "camera.mp4", 30, tlog=pipe.reader))
+    service.serve(0)
+    assert not service.is_open, "the producer is gone"
+    service.finish_log()
+    its.close()
+    assert numbers(tmp_path / "link.tlog") == [0, 1]
 
 
 def test_a_log_that_cannot_be_written_is_the_writers_failure(
