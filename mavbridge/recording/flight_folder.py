@@ -8,11 +8,11 @@ from typing import Any
 from mavbridge.core.records import CameraImage, ImageArray
 from mavbridge.recording import rows
 from mavbridge.recording.folder import (
+    FRAMES,
     TICKS,
-    VIDEO,
     FlightError,
     FlightMeta,
-    frames_of,
+    of_camera,
     read_meta,
     video_of,
 )
@@ -32,7 +32,7 @@ class RecordedFlight:
     """``pyarrow.Table`` with the columns of docs/formats.md."""
     frames: Any
     """``pyarrow.Table`` with one row per image."""
-    video: str = VIDEO
+    video: str = video_of(None)
     """File name of the video."""
     numbers: tuple[int, ...] = ()
     """Number of each row's image in the video. Numbers are missing where files are damaged."""
@@ -93,7 +93,7 @@ def open_cameras(folder: Path) -> list[RecordedFlight]:
 def _frames(
     folder: Path, meta: FlightMeta, camera: str | None, damage: list[str]
 ) -> tuple[Any, tuple[int, ...]]:
-    stem, video = frames_of(camera), video_of(camera)
+    stem, video = of_camera(FRAMES, camera), video_of(camera)
     has_table = table_exists(folder / stem)
     has_video = (folder / video).exists()
     if not (has_table and has_video):

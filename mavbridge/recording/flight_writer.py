@@ -13,12 +13,13 @@ from mavbridge.core.records import Solve, Tick, VisionTick
 from mavbridge.core.vehicle import Action, ForwardedPacket
 from mavbridge.recording import replay_files, rows
 from mavbridge.recording.folder import (
+    FEATURES,
+    FRAMES,
     PACKETS,
     SOLVES,
     TICKS,
     FlightMeta,
-    features_of,
-    frames_of,
+    of_camera,
     video_of,
     write_meta,
 )
@@ -129,7 +130,9 @@ class FlightWriter:
         self._packets = self._table(PACKETS, replay_files.PACKETS) if with_replay else None
         if with_replay and self.meta.mode == "dual":  # else features are only resized images
             for camera in self._cameras:
-                camera.features = self._table(features_of(camera.name), replay_files.FEATURES)
+                camera.features = self._table(
+                    of_camera(FEATURES, camera.name), replay_files.FEATURES
+                )
 
     def _table(self, stem: str, schema: pa.Schema) -> TableWriter:
         table = TableWriter(self._folder / stem, schema)
@@ -155,7 +158,7 @@ class FlightWriter:
             return
         if camera.frames is None:
             with self._writing():
-                camera.frames = self._table(frames_of(camera.name), self._frames_schema)
+                camera.frames = self._table(of_camera(FRAMES, camera.name), self._frames_schema)
         row = FrameRow(
             frame_id=vision.frame_id,
             captured_ns=vision.captured_ns,

@@ -20,7 +20,6 @@ META = "meta.json"
 TICKS = "ticks"
 FRAMES = "frames"
 """Stems of the tables: .arrows while they grow, .parquet once they are complete."""
-VIDEO = "camera.mp4"
 TLOG = "link.tlog"
 SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
 """Stems of the tables for a replay."""
@@ -32,19 +31,14 @@ VERSION = 1
 FlightSource = Literal["flight", "demonstration", "dagger", "pilot"]
 
 
+def of_camera(stem: str, camera: str | None) -> str:
+    """Return the stem of a file or table of the first camera (None), or of the named one."""
+    return stem if camera is None else f"{stem}_{camera}"
+
+
 def video_of(camera: str | None) -> str:
-    """Return the video's file name for the first camera, or for the named one."""
-    return VIDEO if camera is None else f"camera_{camera}.mp4"
-
-
-def frames_of(camera: str | None) -> str:
-    """Return the stem of a camera's table of frames."""
-    return FRAMES if camera is None else f"{FRAMES}_{camera}"
-
-
-def features_of(camera: str | None) -> str:
-    """Return the stem of a camera's table of features."""
-    return FEATURES if camera is None else f"{FEATURES}_{camera}"
+    """Return the file name of a camera's video."""
+    return of_camera("camera", camera) + ".mp4"
 
 
 def require_extra(what: str) -> None:
@@ -77,7 +71,8 @@ def prepare_folder(folder: Path, flag: str) -> None:
 def remove_flight(folder: Path, cameras: Sequence[str]) -> None:
     """Delete the files of a recorded flight; other files, and the folder, stay."""
     names = (None, *cameras[1:])
-    stems = (TICKS, SOLVES, PACKETS, *map(frames_of, names), *map(features_of, names))
+    of_cameras = [of_camera(stem, name) for stem in (FRAMES, FEATURES) for name in names]
+    stems = (TICKS, SOLVES, PACKETS, *of_cameras)
     tables = (f"{stem}.{ending}" for stem in stems for ending in ("arrows", "parquet"))
     for name in (META, SETTINGS, TLOG, *map(video_of, names), *tables):
         with suppress(OSError):

@@ -14,12 +14,13 @@ from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.tlog import read_tlog
 from mavbridge.recording import replay_files, rows
 from mavbridge.recording.folder import (
+    FEATURES,
     PACKETS,
     SOLVES,
     TICKS,
     TLOG,
     FlightMeta,
-    features_of,
+    of_camera,
     read_meta,
 )
 from mavbridge.recording.replay_files import (
@@ -171,7 +172,7 @@ def _features(
     if meta.mode != "dual":
         return ()
     tables = [
-        read_table(folder / features_of(name), replay_files.FEATURES, damage=damage)
+        read_table(folder / of_camera(FEATURES, name), replay_files.FEATURES, damage=damage)
         for name in (None, *meta.contract.cameras[1:])
     ]
     return tuple(tuple(read_features(table)) for table in tables)
