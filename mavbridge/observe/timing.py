@@ -273,6 +273,11 @@ class FlownChunk(NamedTuple):
     computed_ns: int
     attitude_ns: int | None
 
+    def period_ns(self, last: "FlownChunk") -> int:
+        """Return the time since the one before. Chunks in between, overtaken by newer ones before
+        any send, were computed in time nevertheless."""
+        return (self.computed_ns - last.computed_ns) // (self.serial - last.serial)
+
 
 class FlownChunks:
     """Finds each chunk by the tick that flew it first, within each stretch of flight."""
@@ -318,12 +323,11 @@ class _Chunks:
             self._predict.add(tick.predict_ns)
         if last is None:
             return
-        # A chunk overtaken by a newer one before any send was computed in time nevertheless.
-        count, span_ns = newest.serial - last.serial, newest.computed_ns - last.computed_ns
-        self._intervals += count
-        self._span_ns += span_ns
-        self._period.add(span_ns // count)
-        self._late += span_ns // count > self._late_ns
+        self._intervals += newest.serial - last.serial
+        self._span_ns += newest.computed_ns - last.computed_ns
+        period_ns = newest.period_ns(last)
+        self._period.add(period_ns)
+        self._late += period_ns > self._late_ns
 
     def report(self) -> ActionReport:
         return ActionReport(

@@ -152,9 +152,7 @@ class TimingPlots:
         for tick in ticks:
             newest, last = self._chunks.add(tick)
             if newest is not None and last is not None:
-                # Also counts chunks that a newer one overtook before any send, as the report does.
-                span_ns = newest.computed_ns - last.computed_ns
-                period_ns = span_ns // (newest.serial - last.serial)
+                period_ns = newest.period_ns(last)
                 self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
             if newest is not None and tick.predict_ns is not None:
                 self._spreads[layout.PREDICT].extend([(tick.sent_ns, tick.predict_ns)])

@@ -116,9 +116,7 @@ def _late_chunks(
         solve, last = chunks.add(tick)
         if solve is None or last is None:
             continue
-        # Chunks in between, overtaken by newer ones before any send, were not late.
-        period_ns = (solve.computed_ns - last.computed_ns) / (solve.serial - last.serial)
-        if period_ns > LATE_PERIODS * chunk_ns:
+        if (period_ns := solve.period_ns(last)) > LATE_PERIODS * chunk_ns:
             delay_ms = (period_ns - chunk_ns) / NS_PER_MS
             cause = _cause(last, solve, chunk_ns, arrivals)
             yield _delay(_t_s(ticks, tick.woke_ns), "late chunk", delay_ms, cause)
