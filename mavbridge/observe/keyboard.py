@@ -6,6 +6,7 @@ import signal
 import sys
 import termios
 import threading
+import tty
 from collections.abc import Callable, Sequence
 
 from mavbridge.core.stopping import Worker
@@ -88,13 +89,11 @@ class Keyboard:
     def _take(self, fd: int) -> None:
         """Have keys delivered singly, without echo: at the start, and after Ctrl-Z and fg."""
         modes = termios.tcgetattr(fd)
-        if not modes[_LOCAL_MODES] & (termios.ICANON | termios.ECHO):
-            return
-        self._old_modes = termios.tcgetattr(fd)
-        modes[_LOCAL_MODES] &= ~(termios.ICANON | termios.ECHO)
-        termios.tcflush(fd, termios.TCIFLUSH)  # keys typed before the flight must not engage it
-        # TCSANOW: the other modes wait until a stopped terminal has shown all output.
-        termios.tcsetattr(fd, termios.TCSANOW, modes)
+        if modes[_LOCAL_MODES] & (termios.ICANON | termios.ECHO):
+            self._old_modes = modes
+            termios.tcflush(fd, termios.TCIFLUSH)  # keys typed before the flight must not engage it
+            # TCSANOW: the other modes wait until a stopped terminal has shown all output.
+            tty.setcbreak(fd, termios.TCSANOW)
 
     def _restore(self, fd: int) -> None:
         try:
