@@ -7,7 +7,6 @@ import logging
 import multiprocessing
 import os
 import signal
-import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -20,6 +19,7 @@ from typing import TypeAlias, TypeVar
 from mavbridge.config.episodes import WorkersConfig
 from mavbridge.core.address import host_port
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.observe.viewer_target import listens
 from mavbridge.simulation.referee import EpisodeInterruptedError
 
 Job = TypeVar("Job")
@@ -174,15 +174,10 @@ def _never() -> bool:
 
 def _require_reachable(address: str) -> None:
     """Raise UserError if nothing answers at the address: Ray would retry for long."""
-    if address in ("auto", "local"):
-        return
-    try:
-        if (target := host_port(address.removeprefix("ray://"))) is None:
-            raise ValueError
-        socket.create_connection(target, CONNECT_TIMEOUT_S).close()
-    except (OSError, ValueError) as error:
-        reason = error.strerror or error if isinstance(error, OSError) else "no port number"
+    target = host_port(address.removeprefix("ray://"))
+    is_there = target is not None and listens(*target, timeout_s=CONNECT_TIMEOUT_S)
+    if address not in ("auto", "local") and not is_there:
         raise UserError(
-            f"--ray {address}: nothing answers there ({reason}); name the head of a cluster as "
-            "HOST:PORT or ray://HOST:PORT (ray start --head starts one), or use --workers alone"
-        ) from error
+            f"--ray {address}: nothing answers there; name the head of a cluster as HOST:PORT or "
+            "ray://HOST:PORT (ray start --head starts one), or use --workers alone"
+        )
