@@ -105,7 +105,7 @@ BAD = [
     (f"{START} --frames 17", "--frames 17 is more than the 16"),
     (f"{START} --exe-steps 17", "--exe-steps 17 is more than the 16"),
     ("imagine --start flight --out a.mp4 --ddim-steps 101", "1..100"),
-    (f"{START} --start-at 5", "too short"),
+    (f"{START} --start-at 5", "no image within 0.05 s of 5.10 s"),
     (f"{START} --decider toge --policy toge:medium", "--checkpoint"),
     (f"{START} --checkpoint a.safetensors", "add --decider toge"),
     (f"{START} --policy onnx:a --single-rate", "policy, dual rate: not of --decider world-model"),
