@@ -17,56 +17,30 @@ one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowSamples:
-    """``B`` windows of ``K`` context frames and ``T`` future frames."""
-
-    frames: Indices
-    """[B, K + T], numbered across all flights."""
-    states: FloatArray
-    """[B, K + T, 13] at the exposures."""
-    actions: FloatArray
-    """[B, T, 4] mean sent stick between the preceding frame and each future frame."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Windows:
-    """All windows of some flights; created by ``find_windows``."""
+    """Windows of ``K`` context frames and ``T`` future frames; created by ``find_windows``."""
 
     frames: Indices
-    """[W, K + T]"""
+    """[W, K + T], numbered across all flights."""
+    actions: FloatArray
+    """[W, T, 4] mean sent stick between the preceding frame and each future frame."""
     states: FloatArray
-    """[N, 13] at each exposure."""
-    sent: NDArray[np.float64]
-    """[N, 4] time integral of the sticks from the start of the flight to each exposure, stick s."""
-    captured_ns: Nanoseconds
-    """[N]"""
-    context_frames: int
+    """[N, 13] at the exposure of each frame of the flights."""
 
     def __len__(self) -> int:
         return len(self.frames)
 
+    def at(self, rows: Indices) -> "Windows":
+        """Return the windows with indices [B]."""
+        return replace(self, frames=self.frames[rows], actions=self.actions[rows])
+
     def among(self, frames: Indices) -> "Windows":
         """Return the windows with all frames in ``frames``; may be empty."""
-        is_there = np.zeros(len(self.states), bool)
-        is_there[frames] = True
-        return replace(self, frames=self.frames[is_there[self.frames].all(axis=1)])
+        return self.at(np.flatnonzero(np.isin(self.frames, frames).all(axis=1)))
 
     def spread(self, count: int) -> "Windows":
         """Return at most ``count`` windows, evenly spread over all flights."""
-        rows = np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.int64)
-        return replace(self, frames=self.frames[rows])
-
-    def samples(self, rows: Indices) -> WindowSamples:
-        """Return the windows with indices [B]."""
-        frames = self.frames[rows]
-        ends = frames[:, self.context_frames - 1 :]
-        elapsed_s = np.diff(self.captured_ns[ends], axis=1)[..., None] / NS_PER_S
-        mean = np.diff(self.sent[ends], axis=1) / elapsed_s
-        return WindowSamples(
-            frames=frames,
-            states=self.states[frames],
-            actions=np.clip(mean, -1.0, 1.0).astype(np.float32),
-        )
+        return self.at(np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.int64))
 
 
 def find_windows(
@@ -77,12 +51,12 @@ def find_windows(
     No window crosses a gap: each of its frames is near its nominal time and has a state.
     """
     dt_ns = round(frame_dt_s * NS_PER_S)
-    states, sent, windows, first = [], [], [], 0
+    states, actions, windows, first = [], [], [], 0
     for flight in flights:
         state, known = _states_at_exposures(flight)
         found = _evenly_spaced(flight.captured_ns, known, context_frames + frames, dt_ns)
         states.append(state)
-        sent.append(_sent_until(flight, flight.captured_ns))
+        actions.append(_mean_sticks(flight, found[:, context_frames - 1 :]))
         windows.append(found + first)
         first += len(state)
     every = np.concatenate(windows)
@@ -95,13 +69,7 @@ def find_windows(
             f"{len(flights[0].captured_ns)} frames are {gap_ns / 1e6:.0f} ms apart): fly longer, "
             f"or record {hz:.0f} images a second, or {2 * hz:.0f} and more"
         )
-    return Windows(
-        frames=every,
-        states=np.concatenate(states),
-        sent=np.concatenate(sent),
-        captured_ns=np.concatenate([flight.captured_ns for flight in flights]),
-        context_frames=context_frames,
-    )
+    return Windows(frames=every, actions=np.concatenate(actions), states=np.concatenate(states))
 
 
 def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -124,15 +92,19 @@ def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.boo
     return state, attitude.covers(captured_ns) & velocity.covers(captured_ns)
 
 
-def _sent_until(flight: FlightData, at_ns: Nanoseconds) -> NDArray[np.float64]:
-    """Integrate the sticks [N, 4] up to each time; a stick is held until the next one."""
-    stamps, sticks = flight.sent_ns, flight.sent.astype(np.float64)
+def _mean_sticks(flight: FlightData, frames: Indices) -> FloatArray:
+    """Return the mean stick [W, T, 4] between neighbours of frames [W, T + 1]; each is held until
+    the next one is sent."""
+    at_ns, stamps, sticks = flight.captured_ns, flight.sent_ns, flight.sent.astype(np.float64)
     held_s = np.diff(stamps)[:, None] / NS_PER_S
     before = np.concatenate([np.zeros((1, ACTION_DIM)), np.cumsum(sticks[:-1] * held_s, axis=0)])
     row = np.searchsorted(stamps, at_ns, side="right") - 1
     since_s = (at_ns - stamps[np.maximum(row, 0)])[:, None] / NS_PER_S
     integral = before[np.maximum(row, 0)] + sticks[np.maximum(row, 0)] * since_s
-    return np.where(row[:, None] >= 0, integral, 0.0)  # neutral before the first
+    sums = np.where(row[:, None] >= 0, integral, 0.0)  # neutral before the first
+    elapsed_s = np.diff(at_ns[frames], axis=1)[..., None] / NS_PER_S
+    mean = np.diff(sums[frames], axis=1) / elapsed_s
+    return np.clip(mean, -1.0, 1.0).astype(np.float32)
 
 
 def _evenly_spaced(

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from policy.contract import STATE_DIM, VELOCITY, FloatArray
+from policy.contract import ACTION_DIM, STATE_DIM, VELOCITY, FloatArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import STICK_SIGNS, mirrored, state_signs
@@ -167,22 +167,23 @@ class WindowBatches:
         sigma: FloatArray,
         knows_actions: NDArray[np.bool_],
     ) -> WindowBatch:
-        config, samples = self._config, self._windows.samples(rows)
-        count, length = samples.frames.shape
+        config, windows = self._config, self._windows.at(rows)
+        count, length = windows.frames.shape
+        states = windows.states[windows.frames]
         shape = config.latent_shape
-        flat = self._latents.read(samples.frames.ravel(), np.repeat(is_mirrored, length))
+        flat = self._latents.read(windows.frames.ravel(), np.repeat(is_mirrored, length))
 
         def drawn(*size: int) -> FloatArray:
             return random.standard_normal((count, *size), dtype=np.float32)
 
         arrays = {
             "latents": flat.reshape(count, length, *shape),
-            "states": mirrored(samples.states, state_signs(samples.states.shape[-1]), is_mirrored),
-            "actions": mirrored(samples.actions, STICK_SIGNS, is_mirrored),
+            "states": mirrored(states, state_signs(STATE_DIM), is_mirrored),
+            "actions": mirrored(windows.actions, STICK_SIGNS, is_mirrored),
             "context_noise": sigma * drawn(config.context_frames, *shape),
             "latent_noise": drawn(config.frames, *shape),
             "motion_noise": drawn(config.frames, MOTION_DIM),
-            "action_noise": drawn(config.frames, samples.actions.shape[-1]),
+            "action_noise": drawn(config.frames, ACTION_DIM),
             "timestep": random.integers(0, config.schedule.num_train_timesteps, count),
             "knows_actions": knows_actions,
             "decoded": random.integers(0, config.frames, (count, DECODED)),
@@ -290,8 +291,8 @@ def set_scales(
     coder.latent_std.copy_(values.std(dim=1).clamp_min(1e-3))
     chosen = windows.spread(SCALE_SAMPLES)
     model.change_std.copy_(_change_std(model, chosen.spread(CHANGE_SAMPLES), latents))
-    samples = chosen.samples(np.arange(len(chosen)))
-    states, actions = torch.from_numpy(samples.states), torch.from_numpy(samples.actions)
+    states = torch.from_numpy(chosen.states[chosen.frames])
+    actions = torch.from_numpy(chosen.actions)
     if mirrors:
         states = torch.cat([states, states * torch.from_numpy(state_signs(STATE_DIM))])
         actions = torch.cat([actions, actions * torch.from_numpy(STICK_SIGNS)])

@@ -145,16 +145,15 @@ def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(tm
     assert 0.1 < (~batch.knows_actions).float().mean() < 0.4
     assert batch.context_noise.std() < CONTEXT_NOISE
     first = batch.latents[:, 0, 0, 0, 0].abs().long()
-    plain = windows.samples(np.searchsorted(windows.frames[:, 0], first.numpy()))
+    plain = windows.at(np.searchsorted(windows.frames[:, 0], first.numpy()))
+    states = torch.from_numpy(plain.states[plain.frames])
     signs = torch.where(is_mirrored, -1.0, 1.0)
     yaw = torch.from_numpy(plain.actions[..., 1]) * signs[:, None]
     torch.testing.assert_close(batch.actions[..., 1], yaw)
-    torch.testing.assert_close(
-        batch.states[..., 9], torch.from_numpy(plain.states[..., 9]) * signs[:, None]
-    )
+    torch.testing.assert_close(batch.states[..., 9], states[..., 9] * signs[:, None])
     # The mirrored state is one that could be flown: its turn fits its rates.
     turned = _turn_about_z(batch.states)
-    flown = _turn_about_z(torch.from_numpy(plain.states))
+    flown = _turn_about_z(states)
     torch.testing.assert_close(turned, flown * signs[:, None], atol=1e-4, rtol=0)
     for part in batches.validation(16):
         assert (part.context_noise == 0).all()
