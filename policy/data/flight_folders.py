@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
@@ -21,7 +22,7 @@ from policy.data.flight_data import (
     NothingToLearnError,
 )
 from policy.data.flight_video import decode_video, with_images
-from policy.data.tables import number_column, read_rows, retyped, stamps, vectors
+from policy.data.tables import read_rows, retyped, stamps, vectors
 from policy.errors import ContractError
 from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
@@ -189,8 +190,8 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
         name=name,
         tick_ns=tick_ns,
         state=state,
-        attitude_ns=_stamps_or(name, ticks, "attitude_ns", tick_ns, _known(state)),
-        velocity_ns=_stamps_or(name, ticks, "velocity_ns", tick_ns, _known(state)),
+        attitude_ns=_stamps_or(ticks, "attitude_ns", tick_ns, _known(state)),
+        velocity_ns=_stamps_or(ticks, "velocity_ns", tick_ns, _known(state)),
         target_ns=target_ns[is_target],
         target=target[is_target],
         sent_ns=sent_ns,
@@ -337,13 +338,11 @@ def _read_table(
 
 
 def _stamps_or(
-    name: str, table: pa.Table, column: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
+    table: pa.Table, column: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
 ) -> Nanoseconds:
     """Return the stamps of the rows to ``use``; other rows, never read, get ``otherwise``."""
-    is_own = use & np.asarray(table[column].is_valid())
-    out = otherwise.copy()
-    out[is_own] = stamps(name, table.filter(pa.array(is_own)), column)
-    return out
+    own = pc.coalesce(table[column], pa.array(otherwise)).to_numpy()
+    return np.where(use, own, otherwise)
 
 
 def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
@@ -351,19 +350,17 @@ def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
 
     A tick without a solve counts as no later than the decisions after it.
     """
-    at_ns = stamps(name, ticks, "woke_ns")
-    inputs = ("chunk_computed_ns", "predict_ns")
-    solved = np.logical_and(*(np.asarray(ticks[column].is_valid()) for column in inputs))
-    rows = ticks.filter(pa.array(solved))
-    at_ns[solved] = np.subtract(*(stamps(name, rows, column) for column in inputs))
+    woke_ns = pa.array(stamps(name, ticks, "woke_ns"))
+    began_ns = pc.subtract(ticks["chunk_computed_ns"], ticks["predict_ns"])
+    at_ns: Nanoseconds = pc.coalesce(began_ns, woke_ns).to_numpy()
     return np.minimum.accumulate(at_ns[::-1])[::-1]
 
 
 def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
     """Return the image's age at the decision behind each tick that had one."""
-    looked: NDArray[np.bool_] = ticks["feature_captured_ns"].is_valid().to_numpy()
-    captured_ns = stamps(name, ticks.filter(pa.array(looked)), "feature_captured_ns")
-    return _decisions(name, ticks)[looked] - captured_ns
+    at_ns = pa.array(_decisions(name, ticks))
+    ages: Nanoseconds = pc.subtract(at_ns, ticks["feature_captured_ns"]).drop_null().to_numpy()
+    return ages
 
 
 def _known(values: FloatArray) -> NDArray[np.bool_]:
@@ -375,9 +372,8 @@ def _gates(name: str, frames: pa.Table) -> FloatArray:
     if "gate_body_m" in frames.column_names:
         out[:, :3] = vectors(name, frames, "gate_body_m", 3)
     if "gate_yaw_rad" in frames.column_names:
-        yaw = frames["gate_yaw_rad"]
-        known = np.asarray(yaw.is_valid())
-        out[known, 3] = number_column(name, frames.filter(yaw.is_valid()), "gate_yaw_rad")
+        yaw_rad = retyped(name, frames, "gate_yaw_rad", pa.float64())["gate_yaw_rad"]
+        out[:, 3] = yaw_rad.to_numpy()  # null is NaN
     if "gate_after_body_m" in frames.column_names:
         out[:, 4:] = vectors(name, frames, "gate_after_body_m", 3)
     return out
