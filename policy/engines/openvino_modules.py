@@ -315,7 +315,7 @@ def quiet() -> Iterator[None]:
         # No converter knows the fused layer of torch's own transformers.
         torch.backends.mha.set_fastpath_enabled(False)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # our shape checks warn; constants are right there
+            warnings.simplefilter("ignore")  # sizes become constants, which is right
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast_path)

@@ -24,13 +24,6 @@ from policy.preprocess import egocentric_columns, egocentric_scale
 HEADS = 4
 
 
-def require_shape(name: str, array: Tensor, *shape: int) -> None:
-    """Raise a ``PolicyError`` unless ``array`` is [B, *shape]."""
-    if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
-        wanted = ", ".join(["B", *map(str, shape)])
-        raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")
-
-
 class StateEncoder(nn.Module):
     """State [B, state_dim] in SI units -> token [B, dim]."""
 
@@ -157,9 +150,9 @@ class BuiltinConfig:
 class BuiltinPolicy(nn.Module):
     """Network behind ``protocol.SingleRatePolicy``, on torch tensors.
 
-    Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that
-    differs from the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
-    Chunks are sticks, even if the contract says rates: ``policy.motion.stick_loop`` converts them.
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units. Steps that the
+    schedule does not have raise a ``PolicyError``. Chunks are sticks, even if the contract says
+    rates: ``policy.motion.stick_loop`` converts them.
     """
 
     head: DiffusionHead
@@ -193,13 +186,10 @@ class BuiltinPolicy(nn.Module):
         return self.head.denoise(noisy, timestep, condition)
 
     def _encode(self, image: Tensor) -> Tensor:
-        require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
         feature: Tensor = self.visual_projection(self.backbone(image))
         return feature
 
     def _sample(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        require_shape("state", state, self.contract.state_dim)
-        require_shape("action_history", history, self.contract.history_len, ACTION_DIM)
         condition = self.condition(feature, self.state_encoder(state), history)
         return self.head.sample(condition, steps)
 
@@ -233,7 +223,6 @@ class Toge(BuiltinPolicy):
         self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
         """Sample a chunk from a cached feature: bit-identical to ``predict`` on its image."""
-        require_shape("feature", feature, self.contract.feature_dim)
         return self._sample(feature, state, action_history, num_diffusion_steps)
 
     @property

@@ -1,5 +1,6 @@
 """LeRobot policies behind the policy protocol: the contract's images and states to its actions."""
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,12 +15,10 @@ class Normaliser(nn.Module):
     def __init__(self, affine: Affine | None) -> None:
         super().__init__()
         self.affine = affine
-        self.shift: Tensor
-        self.divisor: Tensor
-        self.span: Tensor
-        for name in ("shift", "divisor", "span"):
-            array = torch.zeros(1) if affine is None else torch.from_numpy(getattr(affine, name))
-            self.register_buffer(name, array, persistent=False)
+        arrays = (affine.shift, affine.divisor, affine.span) if affine else [np.zeros(1, "f4")] * 3
+        self.shift, self.divisor, self.span = (
+            nn.Buffer(torch.from_numpy(array), persistent=False) for array in arrays
+        )
 
     def forward(self, value: Tensor) -> Tensor:
         """Normalise to the network's input range."""

@@ -6,7 +6,7 @@ from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.nets.names import BACKBONE_NAMES, BackboneName, Network
 from policy.nets.resnet import build_backbone
-from policy.nets.toge import BuiltinConfig, Toge, build_policy
+from policy.nets.toge import BuiltinConfig, build_policy
 from policy.protocol import DualRatePolicy
 
 
@@ -51,20 +51,6 @@ def test_every_input_reaches_the_sticks(kind: Network) -> None:
 def test_a_contract_of_another_network_is_refused(kind, changes, message):
     with pytest.raises(PolicyError, match=message):
         build_policy(BuiltinConfig(kind=kind, contract=Contract(**changes)))
-
-
-@torch.inference_mode()
-def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
-    image, state, history = sample()
-    with pytest.raises(PolicyError, match=r"image must be \[B, 3, 32, 32\]"):
-        small_toge.encode_visual(image[..., :31])
-    feature = small_toge.encode_visual(image)
-    with pytest.raises(PolicyError, match=r"feature must be \[B, 256\]"):
-        small_toge.predict_fast(feature[:, :-1], state, history, 1)
-    with pytest.raises(PolicyError, match=r"state must be \[B, 13\]"):
-        small_toge.predict_fast(feature, state[0], history, 1)
-    with pytest.raises(PolicyError, match=r"action_history must be \[B, 4, 4\]"):
-        small_toge.predict_fast(feature, state, history[:, :3], 1)
 
 
 @pytest.mark.parametrize("name", BACKBONE_NAMES)
