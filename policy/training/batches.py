@@ -20,7 +20,7 @@ from torch import Tensor
 
 from policy.contract import Contract, FloatArray
 from policy.data.flight_data import ImageArray
-from policy.data.frames import FrameStore
+from policy.data.frames import shifted
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline, TrainingSamples
 from policy.training.settings import TrainSettings
@@ -181,11 +181,18 @@ class Batches:
     """Creates batches of one set of flights."""
 
     def __init__(
-        self, timeline: Timeline, store: FrameStore, *, timesteps: int, settings: TrainSettings
+        self,
+        timeline: Timeline,
+        frames: Indices,
+        images: ImageArray,
+        *,
+        timesteps: int,
+        settings: TrainSettings,
     ) -> None:
-        self._timeline, self._store = timeline, store
+        """Take some ``frames`` of the timeline, and the ``images`` [N, H, W, 3] of all flights."""
+        self._timeline, self._images = timeline, images
         self._timesteps, self._settings, self._seed = timesteps, settings, settings.seed
-        self.frames = timeline.frames
+        self.frames = frames
 
     def with_images(self, step: int) -> Batch:
         """Return a batch to train encoder and head."""
@@ -195,7 +202,7 @@ class Batches:
         is_mirrored = self._mirrored(random, count)
         most = round(SHIFT * self._settings.image_size)
         shifts = random.integers(-most, most + 1, size=(count, 2))
-        images = self._store.read(frames, shifts)
+        images = shifted(self._images[frames], shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
         if self._settings.disturb:
             disturb(images, random)
@@ -227,12 +234,7 @@ class Batches:
             part = chosen[start : start + count]
             ticks = self._timeline.draw_ticks(part, random)
             plain = self._timeline.samples(part, ticks, random if self._timeline.by_rates else None)
-            images = self._store.read(part)
-            yield self._batch(random, plain, len(part), images=images)
-
-    def images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
-        """Return images [B, height, width, 3] uint8, plain or all mirrored."""
-        return torch.from_numpy(self._store.read(frames, is_mirrored=is_mirrored))
+            yield self._batch(random, plain, len(part), images=self._images[part])
 
     def _mirrored(self, random: np.random.Generator, count: int) -> NDArray[np.bool_]:
         return (random.random(count) < 0.5) & self._settings.mirror

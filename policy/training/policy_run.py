@@ -24,7 +24,6 @@ from policy.training.batches import (
     Batches,
     FeatureStore,
     StepLoss,
-    encode_frames,
     normalise_image,
 )
 from policy.training.report import Hooks, PolicyValidation, TrainResult
@@ -70,8 +69,17 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
         super().__init__(flights, trainee, policy_stages(settings), hooks, folder)
-        self._batches = self._batches_of(self.kept)
-        self._held = self._batches_of(self.held) if self.held else None
+        timeline = Timeline(self.flights, network.contract, self._ages_ns)
+        self._batches, self._held = (
+            Batches(
+                timeline,
+                np.intersect1d(timeline.frames, self.frames_of(chosen)),
+                self.images,
+                timesteps=network.schedule.num_train_timesteps,
+                settings=settings,
+            )
+            for chosen in (self.kept, self.held)
+        )
         is_measured = any((flight.age_ns > 0).any() for flight in flights)
         if settings.ages is None and not is_measured:
             low_ms, high_ms = USUAL_AGES_MS
@@ -99,13 +107,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         every = self._batches.frames
         if self._teacher is None:
             self._refresh_batch_norm(every)
-        self._encoded = encode_frames(
-            self.features,
-            every,
-            self._encode_images,
-            mirror=self.settings.mirror,
-            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
-        )
+        self._encoded = self.encoded(every)
 
     def _refresh_batch_norm(self, every: Indices) -> None:
         """Recompute the batch norms' statistics from plain images.
@@ -115,18 +117,16 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         count = min(NORM_IMAGES, len(every))
         chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
         parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
+        images = (self._normalised(self.images_of(part)) for part in parts)
         with computing_in(self.device, self.bf16):
-            update_bn((self._images(part, False) for part in parts), self.trainee.policy.backbone)
+            update_bn(images, self.trainee.policy.backbone)
 
-    @torch.inference_mode()
-    def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:
-        with computing_in(self.device, self.bf16):
-            features: Tensor = self.trainee.policy.backbone(self._images(frames, is_mirrored))
+    def features_of(self, images: Tensor) -> Tensor:
+        features: Tensor = self.trainee.policy.backbone(self._normalised(images))
         return features
 
-    def _images(self, frames: Indices, is_mirrored: bool) -> Tensor:
-        """Return normalised images [B, 3, H, W], without augmentation."""
-        images = self._batches.images(frames, is_mirrored=is_mirrored).to(self.device)
+    def _normalised(self, images: Tensor) -> Tensor:
+        """Return images [B, 3, H, W] as the network takes them, without augmentation."""
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._network.contract)
 
     def batch_maker(self) -> Callable[[int], Batch]:
@@ -143,7 +143,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return batch if self._teacher is None else self._teacher.teach(batch)
 
     def validate(self) -> PolicyValidation | None:
-        if self._held is None:
+        if not self.held:
             return None
         with computing_in(self.device, self.bf16):
             batches = self._held.validation(VALIDATION_SAMPLES)
@@ -154,20 +154,11 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def export(self) -> None:
         card = self.card(
             flights=len(self.kept),
-            images=sum(self.store.counts[index] for index in self.kept),
+            images=len(self.frames_of(self.kept)),
             feature_ages_ms=(self._ages_ns[[0, -1]] / NS_PER_MS).tolist(),
         )
         policy = copy.deepcopy(self.average.policy)
         save_checkpoint(self.settings.out, policy, training=card, packed=self.settings.pack)
-
-    def _batches_of(self, indices: list[int]) -> Batches:
-        chosen = [self.flights[index] for index in indices]
-        return Batches(
-            Timeline(chosen, self._network.contract, self._ages_ns),
-            self.store.only(indices),
-            timesteps=self._network.schedule.num_train_timesteps,
-            settings=self.settings,
-        )
 
 
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:

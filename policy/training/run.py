@@ -1,6 +1,6 @@
 """Shared base of all training runs: stages on a budget, validation, the best weights on disk.
 
-    flights -> FrameStore (decoded once) -> batches with images -> encoder learns    -> moving
+    flights -> images (decoded once) -> batches with images -> encoder learns    -> moving
                 `-> features (encoded once) -> batches of features -> the rest learns -> average
 
 All random values are functions of the seed and the step, so equal runs give equal weights.
@@ -23,8 +23,9 @@ from torch import Tensor, nn
 
 from policy.data.flight_data import DatasetError, FlightData, hold_out
 from policy.data.frames import store_frames
+from policy.data.interpolation import Indices
 from policy.errors import PolicyError
-from policy.training.batches import StepLoss, TensorBatch, ahead
+from policy.training.batches import FeatureStore, StepLoss, TensorBatch, ahead, encode_frames
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor
 
@@ -91,7 +92,7 @@ class TrainingRun(ABC, Generic[M, B]):
         self.bf16 = uses_bf16(settings.precision, self.device)
         self.step = 0
         """Completed optimiser steps."""
-        self.features = folder / "data" / "features.f16"
+        self._features = folder / "data" / "features.f16"
         self.average: M = copy.deepcopy(trainee).eval().requires_grad_(False)
         """Moving average of the weights, in eval mode."""
         self._log, self._begun_s = folder / "log.jsonl", hooks.now_s()
@@ -104,13 +105,15 @@ class TrainingRun(ABC, Generic[M, B]):
         """Indices in ``flights`` of the flights to learn from, and of those that are held out."""
         if not self.held:
             self.note("no flight is held out: the last weights will be kept, not the best")
-        self.store = store_frames(
+        (folder / "data").mkdir()
+        self.images, shapes = store_frames(
             self.flights,
-            folder / "data",
+            folder / "data" / "frames.rgb",
             settings.image_size,
             progress=lambda done: self.report_work(f"decoding, {done:.0%}"),
         )
-        if len(shapes := self.store.proportions) > 1:
+        """[N, height, width, 3] uint8 of all flights."""
+        if len(shapes) > 1:
             told = ", ".join(f"{each:g}" for each in shapes)
             self.note(
                 f"the images have different proportions (width by height {told}) and are all made "
@@ -129,8 +132,12 @@ class TrainingRun(ABC, Generic[M, B]):
         """Return the part of a trainee that is frozen in the end."""
 
     @abstractmethod
+    def features_of(self, images: Tensor) -> Tensor:
+        """Return the encoder's features [B, D] of images [B, height, width, 3] uint8."""
+
+    @abstractmethod
     def encode(self) -> None:
-        """Encode the images once, for the stage on features."""
+        """Encode the images once, by ``encoded``, for the stage on features."""
 
     @abstractmethod
     def batch_maker(self) -> Callable[[int], B]:
@@ -147,6 +154,32 @@ class TrainingRun(ABC, Generic[M, B]):
     @abstractmethod
     def export(self) -> None:
         """Write the average weights to ``settings.out``."""
+
+    def frames_of(self, flights: Sequence[int]) -> Indices:
+        """Return the numbers of the images of some flights."""
+        counts = [len(flight.captured_ns) for flight in self.flights]
+        return np.flatnonzero(np.isin(np.repeat(np.arange(len(counts)), counts), flights))
+
+    def images_of(self, frames: Indices, *, is_mirrored: bool = False) -> Tensor:
+        """Return images [..., height, width, 3] on the device, plain or all mirrored."""
+        images = torch.from_numpy(self.images[frames])
+        return (images.flip(-2) if is_mirrored else images).to(self.device)
+
+    def encoded(self, frames: Indices) -> FeatureStore:
+        """Return the features of images with ascending numbers, mirrored too if asked for."""
+
+        @torch.no_grad()
+        def encode(part: Indices, is_mirrored: bool) -> Tensor:
+            with computing_in(self.device, self.bf16):
+                return self.features_of(self.images_of(part, is_mirrored=is_mirrored))
+
+        return encode_frames(
+            self._features,
+            frames,
+            encode,
+            mirror=self.settings.mirror,
+            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
+        )
 
     def learning_rate(self, stage: TrainingStage) -> float:
         """Return the peak learning rate of a stage."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from policy.contract import ACTION_DIM, STATE_DIM, VELOCITY, FloatArray
-from policy.data.frames import FrameStore
+from policy.data.flight_data import ImageArray
 from policy.data.interpolation import Indices
 from policy.data.samples import STICK_SIGNS, mirrored, state_signs
 from policy.data.windows import Windows
@@ -100,20 +100,20 @@ class WindowBatch(TensorBatch):
 
 
 def frame_batch(
-    store: FrameStore,
+    every: ImageArray,
     windows: Windows,
     config: WorldModelConfig,
     settings: WorldModelSettings,
     step: int,
 ) -> FrameBatch:
-    """Return two neighbours of each of the ``windows`` due in a step of the autoencoder."""
+    """Return two neighbours of each of the ``windows`` due in a step of the autoencoder, from the
+    images [N, H, W, 3] of all flights."""
     count = settings.batch_size // 2
     random = np.random.default_rng([settings.seed, step])
     rows = next_of(np.arange(len(windows)), step, count, settings.seed)
     first = random.integers(0, windows.frames.shape[1] - 1, count)
     pairs = np.stack([windows.frames[rows, first], windows.frames[rows, first + 1]], axis=1)
-    images = store.read(pairs.ravel())
-    images = images.reshape(count, 2, *images.shape[1:])
+    images = every[pairs]
     is_mirrored = (random.random(count) < 0.5) & settings.mirror
     images[is_mirrored] = images[is_mirrored, :, :, ::-1]
     noise = random.standard_normal((count, 2, *config.latent_shape), dtype=np.float32)

@@ -9,13 +9,12 @@ from torch import Tensor, nn
 
 from policy.checkpoints.networks import load_world_model, save_world_model
 from policy.data.flight_data import FlightData
-from policy.data.interpolation import Indices
 from policy.data.windows import Windows, find_windows
 from policy.errors import PolicyError
 from policy.nets.world_model.autoencoder import to_unit
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
-from policy.training.batches import FeatureStore, StepLoss, encode_frames
+from policy.training.batches import FeatureStore, StepLoss
 from policy.training.report import Hooks, TrainResult, WorldModelValidation
 from policy.training.run import TrainingRun, computing_in, work_folder
 from policy.training.settings import WorldModelSettings, world_model_stages
@@ -62,11 +61,8 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         model = _starting_model(config, settings)
         super().__init__(flights, model, world_model_stages(settings), hooks, folder)
         windows = self._windows_of(self.flights)
-        flight_of = np.repeat(np.arange(len(self.flights)), self.store.counts)
-        kept, held = (np.isin(flight_of, chosen) for chosen in (self.kept, self.held))
-        self._images_to_learn = int(kept.sum())
-        self._windows = windows.among(np.flatnonzero(kept))
-        self._held = windows.among(np.flatnonzero(held)).spread(VALIDATION_WINDOWS)
+        self._windows = windows.among(self.frames_of(self.kept))
+        self._held = windows.among(self.frames_of(self.held)).spread(VALIDATION_WINDOWS)
         self._latents: FeatureStore | None = None
         self._held_batches: list[WindowBatch] = []
 
@@ -84,14 +80,12 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
     def encoder(self, trainee: WorldModel) -> nn.Module:
         return trainee.autoencoder
 
+    def features_of(self, images: Tensor) -> Tensor:
+        return self.trainee.autoencoder.posterior(to_unit(images))[0].flatten(1)
+
     def encode(self) -> None:
-        latents = self._latents = encode_frames(
-            self.features,
-            np.union1d(self._held.frames, self._windows.frames),
-            self._encode_images,
-            mirror=self.settings.mirror,
-            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
-        )
+        latents = self.encoded(np.union1d(self._held.frames, self._windows.frames))
+        self._latents = latents
         set_scales(self.trainee, self._windows, latents, mirrors=self.settings.mirror)
         if len(self._held):
             batches = WindowBatches(self._held, latents, self._config, self.settings)
@@ -102,7 +96,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         config, settings, windows = self._config, self.settings, self._windows
         if self._latents is not None:
             return WindowBatches(windows, self._latents, config, settings).batch
-        return lambda step: frame_batch(self.store, windows, config, settings, step)
+        return lambda step: frame_batch(self.images, windows, config, settings, step)
 
     def losses(self, batch: FrameBatch | WindowBatch) -> StepLoss:
         if isinstance(batch, FrameBatch):
@@ -113,26 +107,14 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         if not self._held_batches:
             return None
         frames = self._held.frames[:: len(self._held_batches)]
-        images = self._images(frames.ravel())
+        images = self.images_of(frames)
         with computing_in(self.device, self.bf16):
-            return validate_world_model(
-                self.average, self._held_batches, images.reshape(*frames.shape, *images.shape[1:])
-            )
+            return validate_world_model(self.average, self._held_batches, images)
 
     def export(self) -> None:
-        counts = {"flights": len(self.kept), "images": self._images_to_learn}
+        counts = {"flights": len(self.kept), "images": len(self.frames_of(self.kept))}
         card = self.card(**counts, windows=len(self._windows))
         save_world_model(self.settings.out, self.average, training=card)
-
-    @torch.no_grad()
-    def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:
-        images = to_unit(self._images(frames, is_mirrored=is_mirrored))
-        with computing_in(self.device, self.bf16):
-            return self.trainee.autoencoder.posterior(images)[0].flatten(1)
-
-    def _images(self, frames: Indices, *, is_mirrored: bool = False) -> Tensor:
-        images = self.store.read(frames, is_mirrored=is_mirrored)
-        return torch.from_numpy(images).to(self.device)
 
 
 def _starting_model(config: WorldModelConfig, settings: WorldModelSettings) -> WorldModel:

@@ -207,13 +207,9 @@ def test_only_the_end_is_learned_and_the_gates_are_flown_as_before(flights, tmp_
     def errors(path: Path) -> tuple[float, float]:
         """Return the distance of the chunks from the start's and from the pilot's."""
         policy, before = (load_checkpoint(each, fallback=NETWORK) for each in (path, start))
-        store = store_frames(flights[:1], path.with_suffix(".frames"), 32)
-        batches = Batches(
-            Timeline(flights[:1], CONTRACT, np.array([40_000_000])),
-            store,
-            timesteps=100,
-            settings=asked,
-        )
+        images, _ = store_frames(flights[:1], path.with_suffix(".frames"), 32)
+        timeline = Timeline(flights[:1], CONTRACT, np.array([40_000_000]))
+        batches = Batches(timeline, timeline.frames, images, timesteps=100, settings=asked)
         batch = next(batches.validation(64))
         trainee = Trainee(policy, 0.0)
         chunk = trainee.teach(batch).chunk
@@ -237,12 +233,11 @@ def test_only_the_end_is_learned_and_the_gates_are_flown_as_before(flights, tmp_
 
 def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_path, monkeypatch):
     monkeypatch.setattr(batches_module, "disturb", lambda images, _random: images.fill(255))
-    store = store_frames(flights, tmp_path / "frames", 32)
+    images, _ = store_frames(flights, tmp_path / "frames", 32)
     timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
-    batches = Batches(timeline, store, timesteps=100, settings=settings(tmp_path))
+    batches = Batches(timeline, timeline.frames, images, timesteps=100, settings=settings(tmp_path))
     assert (batches.with_images(0).images == 255).all()
     assert not (next(batches.validation(4)).images == 255).all()
-    assert not (batches.images(batches.frames[:4], is_mirrored=False) == 255).all()
 
 
 def test_a_budget_of_time_ends_and_has_time_for_the_head(flights, tmp_path):
