@@ -8,12 +8,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeAlias, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
 
 from policy.errors import ContractError
+from policy.fields import Between, field_kinds, require_fields
 from policy.files import parse_object
 
 CONTRACT_VERSION, OLDEST_VERSION = 6, 4
@@ -108,29 +109,8 @@ STICK_TERMS = (
     *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
 )
 """Fields that decide what a stick does; recorded sticks mean nothing without them."""
-_INTEGERS = {
-    "image_height": (16, 4096),
-    "image_width": (16, 4096),
-    "feature_dim": (0, 1 << 20),  # the cells of an ACT at 640x480 are 153,600
-    "horizon": (1, 1024),
-    "history_len": (1, 1024),
-    "prefix_len": (0, 1024),
-    "observation_steps": (1, 16),
-}
-_NUMBERS: dict[str, tuple[float, float, str]] = {
-    **dict.fromkeys(("chunk_dt_s", "history_dt_s", "observation_dt_s"), (LEAST, 1.0, "seconds")),
-    **dict.fromkeys((*_CHUNK_AGES, "max_stall_s"), (LEAST, 60.0, "seconds")),
-    "max_tilt_deg": (LEAST, 180.0, "degrees"),
-    "max_speed_mps": (LEAST, 1e3, "m/s"),
-    "max_height_m": (LEAST, 1e5, "m"),
-    "max_distance_m": (LEAST, 1e6, "m"),
-    "hover_thrust": (LEAST, 1.0, "of full thrust"),
-    "full_lean_deg": (LEAST, 80.0, "degrees"),
-    "full_yaw_rate_degps": (LEAST, 2000.0, "degrees/s"),
-    **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
-    "depth_unit_m": (1e-6, 1.0, "m"),
-}
-"""Minimum, maximum and unit of each number."""
+Interval: TypeAlias = Annotated[float, Between(LEAST, 1.0, "seconds")]
+Age: TypeAlias = Annotated[float, Between(LEAST, 60.0, "seconds")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +124,8 @@ class Contract:
 
     state_frame: StateFrame = "ned_frd"
     """World and body axes of the state: MAVLink's NED/FRD or ROS's ENU/FLU."""
-    image_height: int = 224
-    image_width: int = 224
+    image_height: Annotated[int, Between(16, 4096)] = 224
+    image_width: Annotated[int, Between(16, 4096)] = 224
     image_mean_rgb: tuple[float, float, float] = IMAGENET_MEAN_RGB
     image_std_rgb: tuple[float, float, float] = IMAGENET_STD_RGB
     image_crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
@@ -156,26 +136,26 @@ class Contract:
     """Order of the three channels. Mean and deviation are in the order red, green, blue in any
     case. With "depth" there is one channel, float32: the distance along the optical axis in metres,
     neither scaled nor shifted, 0 if unknown. It needs a depth camera."""
-    depth_unit_m: float = 0.001
+    depth_unit_m: Annotated[float, Between(1e-6, 1.0, "m")] = 0.001
     """Metres per step of a depth camera's 16-bit pixels; 0.001 means millimetres."""
     cameras: tuple[str, ...] = ("front",)
     """Names of the cameras, in the order of their features; all images have one size."""
     camera_rates_hz: tuple[float, ...] = ()
     """Highest image rate of each camera; empty: the flight's visual rate for all."""
-    feature_dim: int = 0
+    feature_dim: Annotated[int, Between(0, 1 << 20)] = 0  # the cells of an ACT are 153,600
     """F of encode_visual's [B, F], for one camera; 0 without a fast path."""
-    observation_steps: int = 1
+    observation_steps: Annotated[int, Between(1, 16)] = 1
     """Number T of states, and of images of each camera, in one input; oldest first."""
-    observation_dt_s: float = 0.1
+    observation_dt_s: Interval = 0.1
     """Time between observations."""
-    horizon: int = 16
-    chunk_dt_s: float = 0.05
+    horizon: Annotated[int, Between(1, 1024)] = 16
+    chunk_dt_s: Interval = 0.05
     """Time between the actions of a chunk; action 0 acts at the time of the state."""
-    history_len: int = 4
+    history_len: Annotated[int, Between(1, 1024)] = 4
     """Number K of past actions, as sent, oldest first."""
-    history_dt_s: float = 0.05
+    history_dt_s: Interval = 0.05
     """Time between past actions; the newest is history_dt_s before the state."""
-    prefix_len: int = 0
+    prefix_len: Annotated[int, Between(0, 1024)] = 0
     """Number P of rows behind the past actions in the action history: the committed actions, which
     the vehicle flies before the next chunk can take over. Row p acts ``p * chunk_dt_s`` after the
     state, as row p of that chunk. Rows beyond the expected takeover are NaN."""
@@ -195,16 +175,16 @@ class Contract:
     ends and the autopilot holds the place, which a policy without memory cannot."""
     action: ActionKind = "sticks"
     velocity_frame: VelocityFrame = "world"
-    hover_thrust: float = 0.39
+    hover_thrust: Annotated[float, Between(LEAST, 1.0, "of full thrust")] = 0.39
     """Hover thrust in training; a vehicle with another hover thrust gets all thrust in proportion.
     For rates and attitude. 0.39 is the bundled simulator's."""
-    full_lean_deg: float = 30.0
+    full_lean_deg: Annotated[float, Between(LEAST, 80.0, "degrees")] = 30.0
     """Roll and pitch at full stick, in training; linear outside the dead zone. This and the six
     stick fields below it apply to sticks in modes that hold the height; the defaults are
     ArduCopter's."""
-    full_yaw_rate_degps: float = 202.5
-    full_climb_mps: float = 2.5
-    full_descent_mps: float = 2.5
+    full_yaw_rate_degps: Annotated[float, Between(LEAST, 2000.0, "degrees/s")] = 202.5
+    full_climb_mps: Annotated[float, Between(LEAST, 100.0, "m/s")] = 2.5
+    full_descent_mps: Annotated[float, Between(LEAST, 100.0, "m/s")] = 2.5
     lean_dead_zone: float = 0.04
     """Dead zone of the stick in training, as a share of the travel to each side of the centre."""
     yaw_dead_zone: float = 0.04
@@ -212,25 +192,25 @@ class Contract:
     modes: tuple[str, ...] = ()
     """Autopilot modes in which the policy may fly, best first: equal sticks mean a lean angle in
     one mode and a body rate in another. Empty: the usual modes of ``action``."""
-    max_state_age_s: float = 0.1
+    max_state_age_s: Age = 0.1
     """Maximum age of the attitude and body rates behind a command."""
-    max_velocity_age_s: float = 0.25
+    max_velocity_age_s: Age = 0.25
     """Maximum age of the velocity and acceleration behind a command."""
-    max_feature_age_s: float = 0.3
+    max_feature_age_s: Age = 0.3
     """Maximum age of the image behind a command, since its exposure."""
-    max_chunk_age_s: float = 0.3
+    max_chunk_age_s: Age = 0.3
     """Maximum time since the chunk was computed."""
-    max_stall_s: float = 0.25
+    max_stall_s: Age = 0.25
     """Longest time to fly on along a chunk while no newer one arrives; never beyond its horizon.
     The ages of a chunk are judged when it is accepted, and grow during the stall."""
-    max_tilt_deg: float | None = None
+    max_tilt_deg: Annotated[float | None, Between(LEAST, 180.0, "degrees")] = None
     """Lean that the policy needs. This and the three limits below only widen the default envelope
     of a flight (60 degrees); None or a smaller number leaves it. The setting envelope.tilt has the
     last word."""
-    max_speed_mps: float | None = None
-    max_height_m: float | None = None
+    max_speed_mps: Annotated[float | None, Between(LEAST, 1e3, "m/s")] = None
+    max_height_m: Annotated[float | None, Between(LEAST, 1e5, "m")] = None
     """Height above the estimator's origin, where the vehicle was switched on."""
-    max_distance_m: float | None = None
+    max_distance_m: Annotated[float | None, Between(LEAST, 1e6, "m")] = None
     """Horizontal distance from the estimator's origin."""
     version: int = field(default=CONTRACT_VERSION, init=False)
 
@@ -242,6 +222,7 @@ class Contract:
             if self.modes == () and self.action in ACTION_MODES:
                 usual = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else None
                 object.__setattr__(self, "modes", usual or ACTION_MODES[self.action])
+            require_fields(self, ContractError)
             for name, is_right, wanted in chain(self._checked_values(), self._checked_lists()):
                 if not is_right:
                     raise ContractError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
@@ -249,25 +230,12 @@ class Contract:
             raise ContractError(f"malformed contract: {error}") from error
 
     def _checked_values(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield the name of each field of one value, True if it is right, and what it must be."""
-        for name, hint in _HINTS.items():
-            if get_origin(hint) is Literal:
-                choices = get_args(hint)
-                yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
-            if hint is bool:
-                yield name, isinstance(getattr(self, name), bool), "true or false"
-        for name, (low, high) in _INTEGERS.items():
-            value = getattr(self, name)
-            yield name, type(value) is int and low <= value <= high, f"an integer in {low}..{high}"
-        for name, (least, most, unit) in _NUMBERS.items():
-            value = getattr(self, name)
-            is_right = _is_within(value, least, most) or (value is None and name in ENVELOPE_TERMS)
-            yield name, is_right, f"in [{least:g}, {most:g}] {unit}"
+        """Yield name, True if it is right, and what it must be, of a field with another rule."""
         for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
             share = getattr(self, name)
-            yield name, _is_within(share, 0, 0.9) and share < 0.9, "in [0, 0.9) of the travel"
+            yield name, Between(0, 0.9).holds(share) and share < 0.9, "in [0, 0.9) of the travel"
         longest_s = self.horizon * self.chunk_dt_s
-        is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
+        is_play = Between(0, longest_s).holds(self.play_s) and not 0 < self.play_s < LEAST
         yield "play_s", is_play, f"0, or {LEAST:g} to at most the {longest_s:g} s of a chunk"
         is_prefix = self.prefix_len == 0 or self.state_time == "measured"
         wanted = f"less than horizon {self.horizon}, and 0 if state_time is 'execution'"
@@ -275,26 +243,24 @@ class Contract:
 
     def _checked_lists(self) -> Iterator[tuple[str, bool, str]]:
         """Yield as ``_checked_values`` for fields of several values."""
-        for name in _LISTS:
-            yield name, isinstance(getattr(self, name), tuple), "a list"
         for name, low, usual in (
             ("image_mean_rgb", -MOST_PIXEL, IMAGENET_MEAN_RGB),
             ("image_std_rgb", 1e-6, IMAGENET_STD_RGB),
         ):
             rgb = getattr(self, name)
-            is_right = len(rgb) == 3 and all(_is_within(value, low, MOST_PIXEL) for value in rgb)
+            is_right = len(rgb) == 3 and all(Between(low, MOST_PIXEL).holds(value) for value in rgb)
             yield name, is_right, f"3 numbers in [{low:g}, {MOST_PIXEL:g}], for pixels in [0, 1]"
             is_free = not self.is_depth or rgb == usual
             yield name, is_free, "left out: image_channels 'depth' gives metres as they are"
         crop, names, extras = self.image_crop, self.cameras, self.state_extras
-        is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
+        is_crop = len(crop) == 4 and all(Between(0, 1).holds(share) for share in crop)
         is_crop = is_crop and min(crop[2] - crop[0], crop[3] - crop[1]) >= LEAST
         wanted = f"top, left, bottom, right within [0, 1], at least {LEAST:g} apart"
         yield "image_crop", is_crop, wanted
         are_names = len(names) > 0 and len(set(names)) == len(names)
         are_names = are_names and all(map(str.isidentifier, names))
         yield "cameras", are_names, "one or more different names"
-        are_rates = all(_is_within(hz, 0.01, 240) for hz in self.camera_rates_hz)
+        are_rates = all(Between(0.01, 240).holds(hz) for hz in self.camera_rates_hz)
         are_rates = are_rates and len(self.camera_rates_hz) in (0, len(names))
         wanted = f"a rate in [0.01, 240] Hz for each of {names}"
         yield "camera_rates_hz", are_rates, wanted
@@ -381,13 +347,7 @@ class Contract:
         return cls(**data)
 
 
-_HINTS = get_type_hints(Contract)
-_LISTS = [name for name, hint in _HINTS.items() if get_origin(hint) is tuple]
-
-
-def _is_within(value: object, low: float, high: float) -> bool:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and low <= value <= high  # type: ignore[operator]  # False for NaN
+_LISTS = [name for name, (kind, _) in field_kinds(Contract).items() if get_origin(kind) is tuple]
 
 
 def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:

@@ -11,13 +11,13 @@ from mavbridge.config.flags import (
     OUTPUT,
     POLICY,
     RATES,
-    Between,
     Ranged,
     hidden,
 )
 from mavbridge.config.flight import CameraConfig, FlyConfig, ListenConfig
 from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.errors import UserError
+from policy.fields import Between
 
 DeciderName = Literal["toge", "world-model"]
 

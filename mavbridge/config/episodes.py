@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import Between, Ranged, check_range
+from mavbridge.config.flags import Ranged, check_range
 from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.errors import UserError
 from policy.contract import StateTime
+from policy.fields import Between
 from policy.nets.names import BUILTIN_KINDS
 
 AutopilotKind = Literal["ardupilot", "px4"]

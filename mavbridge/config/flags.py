@@ -1,12 +1,12 @@
 """Groups, hidden settings and ranges of flags."""
 
 import math
-from dataclasses import dataclass
 from typing import get_type_hints
 
 from cyclopts import Group, Parameter
 
 from mavbridge.core.errors import UserError
+from policy.fields import Between
 
 
 def check_range(name: str, value: float | None, low: float, high: float, unit: str) -> None:
@@ -15,15 +15,6 @@ def check_range(name: str, value: float | None, low: float, high: float, unit: s
         limits = f"{low:g} and {high:g} {unit}".rstrip()
         flag = name if "." in name else f"--{name}"
         raise UserError(f"{flag} must be between {limits}, got {value:g}")
-
-
-@dataclass(frozen=True)
-class Between:
-    """Range of a number, as metadata of a field of ``Ranged``."""
-
-    low: float
-    high: float
-    unit: str = ""
 
 
 class Ranged:

@@ -13,7 +13,6 @@ from mavbridge.config.flags import (
     ENGAGING,
     OUTPUT,
     VEHICLE,
-    Between,
     Ranged,
     hidden,
     section,
@@ -21,6 +20,7 @@ from mavbridge.config.flags import (
 from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import OnFault, Risk
+from policy.fields import Between
 
 OutputChoice = Literal["auto", "rc-override", "manual-control", "attitude", "rates", "velocity"]
 """``core.vehicle.Output``, or the usual one."""

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import POLICY, RARE, RATES, Between, Ranged, hidden
+from mavbridge.config.flags import POLICY, RARE, RATES, Ranged, hidden
+from policy.fields import Between
 
 STEPS, TOGE_STEPS = 10, 1
 """DDIM steps by default, and those of toge and toge-rates, which fly as well in one

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from policy.adapters.description import DENOISER, DESCRIPTION, ENCODER
 from policy.contract import ACTION_DIM
 from policy.engines.openvino_modules import Traceable
-from policy.nets.diffusion import size_dims
+from policy.nets.diffusion import SIZE_DIMS
 from policy.nets.toge import BuiltinPolicy
 
 OPSET = 18
@@ -29,7 +29,7 @@ def export_onnx(policy: BuiltinPolicy, folder: Path) -> None:
     rest = (
         torch.zeros(1, contract.horizon, ACTION_DIM),
         torch.zeros(1),
-        torch.zeros(1, size_dims(policy.config.size).base_dim),
+        torch.zeros(1, SIZE_DIMS[policy.config.size].base_dim),
         torch.zeros(1, contract.state_dim),
         torch.zeros(1, *contract.history_shape),
     )

@@ -15,14 +15,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.errors import PolicyError
-from policy.nets.names import SIZE_NAMES, Size
+from policy.fields import Between, require_fields
+from policy.nets.names import Size
 from policy.nets.unet1d import UNet1d
 
 BetaSchedule = Literal["squared_cosine", "linear"]
@@ -52,19 +53,14 @@ class DdimStep:
 class NoiseSchedule:
     """Noise schedule of the training, and the quantity that the net predicts."""
 
-    num_train_timesteps: int = TRAIN_TIMESTEPS
+    num_train_timesteps: Annotated[int, Between(1, 1000)] = TRAIN_TIMESTEPS
     betas: BetaSchedule = "squared_cosine"
     prediction: Prediction = "sample"
     """``sample``: the net returns x_0; ``epsilon``: the noise. With ``epsilon``, the first steps
     divide by sqrt(a_t), which is 5e-4 at t = 99, to get x_0; with few steps ``sample`` is safer."""
 
     def __post_init__(self) -> None:
-        total = self.num_train_timesteps
-        if not isinstance(total, int) or not 1 <= total <= 1000:
-            raise PolicyError(f"num_train_timesteps must be an integer in 1..1000, got {total}")
-        for name, known in (("betas", BetaSchedule), ("prediction", Prediction)):
-            if (value := getattr(self, name)) not in get_args(known):
-                raise PolicyError(f"{name} {value!r} is unknown; use one of {get_args(known)}")
+        require_fields(self, PolicyError)
 
     def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
         """Return the reverse steps of a solve with ``count`` network calls, noisiest first.
@@ -163,20 +159,13 @@ class SizeDims(NamedTuple):
     """Channels of the U-Net's levels."""
 
 
-_SIZES: dict[Size, SizeDims] = {
+SIZE_DIMS: dict[Size, SizeDims] = {
     "small": SizeDims(256, (96, 160, 256)),
     "medium": SizeDims(384, (192, 320, 512)),
     "large": SizeDims(512, (320, 640, 960)),
 }
 """Heads of about 3, 12 and 40 million parameters. On a CPU every diffusion step reads all weights
 once: 100 Hz with 10 steps allows about 3 million weights on one core."""
-
-
-def size_dims(size: Size) -> SizeDims:
-    """Return the dimensions of a size."""
-    if size not in _SIZES:
-        raise PolicyError(f"size {size!r} is unknown; use one of {list(SIZE_NAMES)}")
-    return _SIZES[size]
 
 
 class DiffusionHead(nn.Module):
@@ -194,7 +183,7 @@ class DiffusionHead(nn.Module):
 
     def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:
         super().__init__()
-        dims = size_dims(size)
+        dims = SIZE_DIMS[size]
         self.schedule = schedule
         self.unet = UNet1d(
             horizon=contract.horizon, condition_dim=dims.base_dim, widths=dims.widths

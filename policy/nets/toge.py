@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
+from policy.fields import require_fields
 from policy.nets.attention import Attention, is_tracing
-from policy.nets.diffusion import DiffusionHead, NoiseSchedule, size_dims
-from policy.nets.names import BACKBONE_NAMES, BackboneName, Network, Size
+from policy.nets.diffusion import SIZE_DIMS, DiffusionHead, NoiseSchedule
+from policy.nets.names import BackboneName, Network, Size
 from policy.nets.resnet import build_backbone
 from policy.preprocess import egocentric_columns, egocentric_scale
 
@@ -124,14 +125,10 @@ class BuiltinConfig:
     @property
     def feature_dim(self) -> int:
         """Width of the cached feature; 0 for the network without a fast path."""
-        return size_dims(self.size).base_dim if self.kind == "toge" else 0
+        return SIZE_DIMS[self.size].base_dim if self.kind == "toge" else 0
 
     def __post_init__(self) -> None:
-        size_dims(self.size)
-        if self.backbone not in BACKBONE_NAMES:
-            raise PolicyError(
-                f"backbone {self.backbone!r} is unknown; use one of {list(BACKBONE_NAMES)}"
-            )
+        require_fields(self, PolicyError)
         if self.contract.feature_dim not in (0, self.feature_dim):
             raise ContractError(
                 f"the contract says feature_dim {self.contract.feature_dim}, but {self.kind} "
@@ -159,7 +156,7 @@ class BuiltinPolicy(nn.Module):
 
     def __init__(self, config: BuiltinConfig) -> None:
         super().__init__()
-        dim = size_dims(config.size).base_dim
+        dim = SIZE_DIMS[config.size].base_dim
         self.contract = replace(config.contract, feature_dim=config.feature_dim)
         self.config = replace(config, contract=self.contract)
         self.backbone = build_backbone(config.backbone)
@@ -245,7 +242,7 @@ class ResnetUnet(BuiltinPolicy):
 
     def __init__(self, config: BuiltinConfig) -> None:
         super().__init__(config)
-        dim = size_dims(config.size).base_dim
+        dim = SIZE_DIMS[config.size].base_dim
         history_dim = self.contract.history_len * ACTION_DIM
         self.fuse = nn.Sequential(
             nn.Linear(2 * dim + history_dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim)

@@ -8,32 +8,14 @@ as many steps.
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from policy.errors import PolicyError
+from policy.fields import Between, field_kinds
 
 Precision = Literal["auto", "bf16", "f32"]
 DEFAULT_MINUTES = 45.0
 MAX_AGE_MS = 1000
-
-_RANGES: dict[str, tuple[float, float]] = {
-    "minutes": (0.01, 100_000),
-    "steps": (1, 10**9),
-    "image_size": (32, 1024),
-    "batch_size": (2, 4096),
-    "learning_rate": (0, 1e30),
-    "weight_decay": (0, 1),
-    "ema_decay": (0, 1),
-    "seed": (0, 2**63 - 1),
-    "validation_fraction": (0, 0.9),
-    "validations": (1, 10_000),
-    "repeats": (1, 100),
-    "head_batch_size": (1, 100_000),
-    "gate_weight": (0, 10_000),
-    "window_batch_size": (1, 4096),
-    "autoencoder_share": (0.01, 0.99),
-    "decision_share": (0, 1),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,32 +24,32 @@ class RunSettings:
 
     out: Path
     """Checkpoint to write (.safetensors); the log of the run is kept beside it."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, Between(0.01, 100_000)] = None
     """Length of the training, without decoding and encoding the images; 45 if neither this nor
     --steps is given."""
-    steps: int | None = None
+    steps: Annotated[int | None, Between(1, 10**9)] = None
     """Length of the training in optimiser steps, in place of --minutes."""
-    image_size: int = 96
+    image_size: Annotated[int, Between(32, 1024)] = 96
     """Pixels along a side of the images that the encoder takes."""
-    batch_size: int = 32
+    batch_size: Annotated[int, Between(2, 4096)] = 32
     """Images a step while the encoder learns."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Between(0, 1e30)] = 1e-3
     """Peak learning rate of AdamW."""
-    weight_decay: float = 0.02
+    weight_decay: Annotated[float, Between(0, 1)] = 0.02
     """Weight decay of AdamW."""
-    ema_decay: float = 0.999
+    ema_decay: Annotated[float, Between(0, 1)] = 0.999
     """Decay of the moving average of the weights, which is what gets exported."""
     mirror: bool = True
     """Mirror half of the samples; --no-mirror for a camera that does not look straight ahead."""
-    seed: int = 0
+    seed: Annotated[int, Between(0, 2**63 - 1)] = 0
     """Seed of weights, order and noise."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1."""
     precision: Precision = "auto"
     """Number format of the computation; auto takes bf16 where the hardware multiplies it."""
-    validation_fraction: float = 0.1
+    validation_fraction: Annotated[float, Between(0, 0.9)] = 0.1
     """Share of the flights that are held out; those of one course stay together."""
-    validations: int | None = None
+    validations: Annotated[int | None, Between(1, 10_000)] = None
     """Validations in the run, evenly spaced; one every two minutes or fifty steps, 4 to 20, if not
     given."""
     include_failed: bool = False
@@ -81,12 +63,11 @@ class RunSettings:
             raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
         if self.minutes is not None and self.steps is not None:
             raise PolicyError("--minutes and --steps contradict each other: give one of them")
-        for name, value in vars(self).items():
-            low, high = _RANGES.get(name, (None, None))
-            if value is None or low is None or high is None or low <= value <= high:
-                continue
-            flag = name.replace("_", "-")
-            raise PolicyError(f"--{flag} must be between {low:g} and {high:g}, got {value:g}")
+        for name, (_, limits) in field_kinds(type(self)).items():
+            value, flag = getattr(self, name), name.replace("_", "-")
+            if limits is not None and value is not None and not limits.holds(value):
+                told = f"between {limits.low:g} and {limits.high:g}"
+                raise PolicyError(f"--{flag} must be {told}, got {value:g}")
 
     def fraction(self, step: int, spent_s: float) -> float:
         """Return the used share of the budget after this number of steps and seconds, 0 to 1."""
@@ -124,11 +105,11 @@ class TrainSettings(RunSettings):
     only_end: bool = False
     """Learn only what follows the last gate. Before it, --start-from is imitated in place of the
     pilot, and its encoder stays as it is: the policy flies the gates as before."""
-    repeats: int = 2
+    repeats: Annotated[int, Between(1, 100)] = 2
     """Moments after its exposure for which an encoded image is used in a step."""
-    head_batch_size: int = 256
+    head_batch_size: Annotated[int, Between(1, 100_000)] = 256
     """Samples a step while the head learns alone."""
-    gate_weight: float = 100.0
+    gate_weight: Annotated[float, Between(0, 10_000)] = 100.0
     """Weight of the loss of gate positions that are read off the feature, in flights that hold
     them; 0 = off. The sticks of a few flights alone teach an encoder those flights' courses."""
     disturb: bool = True
@@ -165,19 +146,19 @@ class TrainSettings(RunSettings):
 class WorldModelSettings(RunSettings):
     """Settings of the training of a world model."""
 
-    image_size: int = 64
+    image_size: Annotated[int, Between(32, 1024)] = 64
     """Pixels along a side of the frames."""
-    batch_size: int = 8
+    batch_size: Annotated[int, Between(2, 4096)] = 8
     """Frames a step while the autoencoder learns."""
-    learning_rate: float = 2e-3
+    learning_rate: Annotated[float, Between(0, 1e30)] = 2e-3
     """Peak learning rate of AdamW."""
-    window_batch_size: int = 8
+    window_batch_size: Annotated[int, Between(1, 4096)] = 8
     """Windows a step while the dynamics learns."""
     start_from: Path | None = None
     """World model whose autoencoder is kept as it is; the dynamics learns anew."""
-    autoencoder_share: float = 0.25
+    autoencoder_share: Annotated[float, Between(0.01, 0.99)] = 0.25
     """Share of the run in which the autoencoder learns, unless it is kept."""
-    decision_share: float = 0.3
+    decision_share: Annotated[float, Between(0, 1)] = 0.3
     """Share of the windows in which the model has to find the actions."""
 
 

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
-from policy.nets.diffusion import size_dims
+from policy.nets.diffusion import SIZE_DIMS
 from policy.nets.toge import BuiltinPolicy
 from policy.training.batches import Batch, StepLoss, normalised
 from policy.training.report import PolicyValidation
@@ -37,7 +37,7 @@ class Trainee(nn.Module):
     def __init__(self, policy: BuiltinPolicy, gate_weight: float) -> None:
         super().__init__()
         self.policy = policy
-        self.gate_head = nn.Linear(size_dims(policy.config.size).base_dim, GATE_LABELS)
+        self.gate_head = nn.Linear(SIZE_DIMS[policy.config.size].base_dim, GATE_LABELS)
         self._gate_weight = gate_weight
         self.stick_mean = nn.Buffer(torch.zeros(ACTION_DIM))
         self.stick_std = nn.Buffer(torch.ones(ACTION_DIM))
