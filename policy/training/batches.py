@@ -9,8 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -48,8 +47,6 @@ VALIDATION_KEY = 2**31
 """Random key of validation samples, in place of a step; no run has this many steps."""
 T = TypeVar("T")
 ENCODE_BATCH = 64
-Encode: TypeAlias = Callable[[Indices, bool], Tensor]
-"""(images, True to mirror all of them) -> [B, D]."""
 
 
 def disturb(images: ImageArray, random: np.random.Generator) -> None:
@@ -222,12 +219,12 @@ class Batches:
         samples = self._samples(random, frames, is_mirrored, 1)
         return self._batch(random, samples, len(frames), features=rows)
 
-    def validation(self, samples: int) -> Iterator[Batch]:
+    def validation(self, frames: Indices, samples: int) -> Iterator[Batch]:
         """Return the same samples at each call, not augmented, with inputs hidden as in training.
 
         Otherwise, validation by body rates would favour weights that copy.
         """
-        frames, count = self.frames, self._settings.batch_size
+        count = self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
         for start in range(0, len(chosen), count):
             random = np.random.default_rng([self._seed, VALIDATION_KEY, start])
@@ -322,27 +319,3 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
     mean = torch.tensor(contract.image_mean_rgb, device=image.device).view(1, 3, 1, 1)
     std = torch.tensor(contract.image_std_rgb, device=image.device).view(1, 3, 1, 1)
     return (image - mean) / std
-
-
-def encode_frames(
-    path: Path,
-    frames: Indices,
-    encode: Encode,
-    *,
-    mirror: bool,
-    progress: Callable[[float], None],
-) -> FeatureStore:
-    """Encode images with ascending numbers to ``path``, each once, or plain and mirrored.
-
-    ``progress`` is called with the completed share.
-    """
-    ways = (False, True) if mirror else (False,)
-    parts = np.array_split(frames, -(-len(frames) // ENCODE_BATCH))
-    with path.open("wb") as file:
-        for way in ways:
-            for index, part in enumerate(parts):
-                encoded = encode(part, way).to(torch.float16)
-                file.write(encoded.cpu().numpy().tobytes())
-                progress((way + index / len(parts)) / len(ways))
-    rows = np.memmap(path, np.float16, mode="r").reshape(len(ways), len(frames), -1)
-    return FeatureStore(rows, frames)

@@ -22,7 +22,6 @@ from policy.training.batches import (
     ENCODE_BATCH,
     Batch,
     Batches,
-    FeatureStore,
     StepLoss,
     normalise_image,
 )
@@ -70,16 +69,11 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
         super().__init__(flights, trainee, policy_stages(settings), hooks, folder)
         timeline = Timeline(self.flights, network.contract, self._ages_ns)
-        self._batches, self._held = (
-            Batches(
-                timeline,
-                np.intersect1d(timeline.frames, self.frames_of(chosen)),
-                self.images,
-                timesteps=network.schedule.num_train_timesteps,
-                settings=settings,
-            )
-            for chosen in (self.kept, self.held)
+        kept, self._held = (
+            np.intersect1d(timeline.frames, self.frames_of(part)) for part in (self.kept, self.held)
         )
+        steps = network.schedule.num_train_timesteps
+        self._batches = Batches(timeline, kept, self.images, timesteps=steps, settings=settings)
         is_measured = any((flight.age_ns > 0).any() for flight in flights)
         if settings.ages is None and not is_measured:
             low_ms, high_ms = USUAL_AGES_MS
@@ -90,7 +84,6 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         targets = np.concatenate([self.flights[index].target for index in self.kept])
         for each in (self.trainee, self.average):
             each.set_sticks(targets)
-        self._encoded: FeatureStore | None = None
 
     def check(self, flight: FlightData) -> None:
         Timeline([flight], self._network.contract, self._ages_ns)
@@ -107,7 +100,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         every = self._batches.frames
         if self._teacher is None:
             self._refresh_batch_norm(every)
-        self._encoded = self.encoded(every)
+        self.features = self.encode_frames(every)
 
     def _refresh_batch_norm(self, every: Indices) -> None:
         """Recompute the batch norms' statistics from plain images.
@@ -130,8 +123,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._network.contract)
 
     def batch_maker(self) -> Callable[[int], Batch]:
-        features = self._encoded
-        if features is not None:
+        if (features := self.features) is not None:
             return lambda step: self._batches.with_features(step, features)
         return self._batches.with_images
 
@@ -146,7 +138,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         if not self.held:
             return None
         with computing_in(self.device, self.bf16):
-            batches = self._held.validation(VALIDATION_SAMPLES)
+            batches = self._batches.validation(self._held, VALIDATION_SAMPLES)
             on_device = (batch.to(self.device) for batch in batches)
             encoded = map(self.average.encoded, on_device)
             return validate(self.average, map(self._with_targets, encoded))

@@ -11,9 +11,10 @@ import errno
 import json
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, Generic, TypeVar
 
@@ -25,7 +26,7 @@ from policy.data.flight_data import DatasetError, FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.data.interpolation import Indices
 from policy.errors import PolicyError
-from policy.training.batches import FeatureStore, StepLoss, TensorBatch, ahead, encode_frames
+from policy.training.batches import ENCODE_BATCH, FeatureStore, StepLoss, TensorBatch, ahead
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor
 
@@ -56,10 +57,10 @@ def work_folder(settings: RunSettings) -> Iterator[Path]:
         shutil.rmtree(folder / "data", ignore_errors=True)  # of a run that was killed
         yield folder
     except OSError as error:
+        told: object = error.strerror or error
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            advice = "the disk is full: make room, or write --out elsewhere"
-            raise TrainingError(f"{folder}: {advice}") from error
-        raise TrainingError(f"{folder}: {error.strerror or error}") from error
+            told = "the disk is full: make room, or write --out elsewhere"
+        raise TrainingError(f"{folder}: {told}") from error
     finally:
         shutil.rmtree(folder / "data", ignore_errors=True)
         with suppress(OSError):  # it holds a log, unless the run was refused
@@ -92,7 +93,9 @@ class TrainingRun(ABC, Generic[M, B]):
         self.bf16 = uses_bf16(settings.precision, self.device)
         self.step = 0
         """Completed optimiser steps."""
-        self._features = folder / "data" / "features.f16"
+        self._path = folder / "data" / "features.f16"
+        self.features: FeatureStore | None = None
+        """None until the encoder is frozen."""
         self.average: M = copy.deepcopy(trainee).eval().requires_grad_(False)
         """Moving average of the weights, in eval mode."""
         self._log, self._begun_s = folder / "log.jsonl", hooks.now_s()
@@ -137,7 +140,7 @@ class TrainingRun(ABC, Generic[M, B]):
 
     @abstractmethod
     def encode(self) -> None:
-        """Encode the images once, by ``encoded``, for the stage on features."""
+        """Set ``features``, by ``encode_frames``, for the stage on them."""
 
     @abstractmethod
     def batch_maker(self) -> Callable[[int], B]:
@@ -165,21 +168,19 @@ class TrainingRun(ABC, Generic[M, B]):
         images = torch.from_numpy(self.images[frames])
         return (images.flip(-2) if is_mirrored else images).to(self.device)
 
-    def encoded(self, frames: Indices) -> FeatureStore:
+    @torch.no_grad()
+    def encode_frames(self, frames: Indices) -> FeatureStore:
         """Return the features of images with ascending numbers, mirrored too if asked for."""
-
-        @torch.no_grad()
-        def encode(part: Indices, is_mirrored: bool) -> Tensor:
-            with computing_in(self.device, self.bf16):
-                return self.features_of(self.images_of(part, is_mirrored=is_mirrored))
-
-        return encode_frames(
-            self._features,
-            frames,
-            encode,
-            mirror=self.settings.mirror,
-            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
-        )
+        ways = (False, True) if self.settings.mirror else (False,)
+        parts = np.array_split(frames, -(-len(frames) // ENCODE_BATCH))
+        with self._path.open("wb") as file:
+            for done, (way, part) in enumerate(product(ways, parts)):
+                with computing_in(self.device, self.bf16):
+                    encoded = self.features_of(self.images_of(part, is_mirrored=way))
+                file.write(encoded.to(torch.float16).cpu().numpy().tobytes())
+                self.report_work(f"encoding, {done / (len(ways) * len(parts)):.0%}")
+        rows = np.memmap(self._path, np.float16, mode="r").reshape(len(ways), len(frames), -1)
+        return FeatureStore(rows, frames)
 
     def learning_rate(self, stage: TrainingStage) -> float:
         """Return the peak learning rate of a stage."""
@@ -293,8 +294,7 @@ class TrainingRun(ABC, Generic[M, B]):
         validation = self.validate()
         if validation is not None:
             self._report(stage.name, validation=validation)
-            record = {"step": self.step, "stage": stage.name}
-            self._write_log({**record, "validation": asdict(validation)})
+            self._write_log(stage, validation=asdict(validation))
         if stage.trains_encoder and self.encoder_learns_alone:
             return
         if validation is None or self._best is None or validation.loss < self._best.loss:
@@ -311,11 +311,8 @@ class TrainingRun(ABC, Generic[M, B]):
         trainable = [p for p in self.trainee.parameters() if p.requires_grad]
         # No weight decay for biases, norms and other vectors.
         groups = [
-            {
-                "params": [p for p in trainable if p.ndim >= 2],
-                "weight_decay": self.settings.weight_decay,
-            },
-            {"params": [p for p in trainable if p.ndim < 2], "weight_decay": 0.0},
+            {"params": [p for p in trainable if (p.ndim >= 2) == is_matrix], "weight_decay": decay}
+            for is_matrix, decay in ((True, self.settings.weight_decay), (False, 0.0))
         ]
         return torch.optim.AdamW(groups, betas=(0.9, 0.98), fused=True)
 
@@ -348,10 +345,10 @@ class TrainingRun(ABC, Generic[M, B]):
                 "for flights with wrong numbers, or start from other weights"
             )
         self._report(stage.name, losses=losses)
-        record = {"step": self.step, "stage": stage.name, "fraction": self._fraction}
-        self._write_log({**record, **losses, "learning_rate": rate})
+        self._write_log(stage, fraction=self._fraction, **losses, learning_rate=rate)
 
-    def _write_log(self, record: Mapping[str, object]) -> None:
+    def _write_log(self, stage: TrainingStage, **facts: object) -> None:
+        record = {"step": self.step, "stage": stage.name, **facts}
         with self._log.open("a") as file:
             file.write(json.dumps(record) + "\n")
 

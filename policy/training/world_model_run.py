@@ -14,7 +14,7 @@ from policy.errors import PolicyError
 from policy.nets.world_model.autoencoder import to_unit
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
-from policy.training.batches import FeatureStore, StepLoss
+from policy.training.batches import StepLoss
 from policy.training.report import Hooks, TrainResult, WorldModelValidation
 from policy.training.run import TrainingRun, computing_in, work_folder
 from policy.training.settings import WorldModelSettings, world_model_stages
@@ -63,7 +63,6 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         windows = self._windows_of(self.flights)
         self._windows = windows.among(self.frames_of(self.kept))
         self._held = windows.among(self.frames_of(self.held)).spread(VALIDATION_WINDOWS)
-        self._latents: FeatureStore | None = None
         self._held_batches: list[WindowBatch] = []
 
     def check(self, flight: FlightData) -> None:
@@ -84,8 +83,8 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         return self.trainee.autoencoder.posterior(to_unit(images))[0].flatten(1)
 
     def encode(self) -> None:
-        latents = self.encoded(np.union1d(self._held.frames, self._windows.frames))
-        self._latents = latents
+        frames = np.union1d(self._held.frames, self._windows.frames)
+        latents = self.features = self.encode_frames(frames)
         set_scales(self.trainee, self._windows, latents, mirrors=self.settings.mirror)
         if len(self._held):
             batches = WindowBatches(self._held, latents, self._config, self.settings)
@@ -94,8 +93,8 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
 
     def batch_maker(self) -> Callable[[int], FrameBatch | WindowBatch]:
         config, settings, windows = self._config, self.settings, self._windows
-        if self._latents is not None:
-            return WindowBatches(windows, self._latents, config, settings).batch
+        if self.features is not None:
+            return WindowBatches(windows, self.features, config, settings).batch
         return lambda step: frame_batch(self.images, windows, config, settings, step)
 
     def losses(self, batch: FrameBatch | WindowBatch) -> StepLoss:

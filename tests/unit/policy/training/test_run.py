@@ -210,7 +210,7 @@ def test_only_the_end_is_learned_and_the_gates_are_flown_as_before(flights, tmp_
         images, _ = store_frames(flights[:1], path.with_suffix(".frames"), 32)
         timeline = Timeline(flights[:1], CONTRACT, np.array([40_000_000]))
         batches = Batches(timeline, timeline.frames, images, timesteps=100, settings=asked)
-        batch = next(batches.validation(64))
+        batch = next(batches.validation(timeline.frames, 64))
         trainee = Trainee(policy, 0.0)
         chunk = trainee.teach(batch).chunk
         return (
@@ -237,7 +237,7 @@ def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_p
     timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
     batches = Batches(timeline, timeline.frames, images, timesteps=100, settings=settings(tmp_path))
     assert (batches.with_images(0).images == 255).all()
-    assert not (next(batches.validation(4)).images == 255).all()
+    assert not (next(batches.validation(timeline.frames, 4)).images == 255).all()
 
 
 def test_a_budget_of_time_ends_and_has_time_for_the_head(flights, tmp_path):

@@ -17,7 +17,7 @@ from policy.errors import PolicyError
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.nets.world_model.motion import motion_since
-from policy.training.batches import FeatureStore, encode_frames
+from policy.training.batches import FeatureStore
 from policy.training.report import TrainingProgress, TrainResult
 from policy.training.settings import WorldModelSettings
 from policy.training.world_model_losses import (
@@ -120,20 +120,16 @@ def test_an_autoencoder_that_is_kept_stays_as_it_is(flights, tmp_path):
         run(flights, made, model=replace(SMALL_WORLD, latent_channels=8))
 
 
-def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> FeatureStore:
+def latents_of(windows_frames: int) -> FeatureStore:
     """Latents that tell their frame, and whether it was mirrored."""
-
-    def encode(frames: np.ndarray, is_mirrored: bool) -> torch.Tensor:
-        sign = -1.0 if is_mirrored else 1.0
-        return sign * torch.from_numpy(frames)[:, None].float().expand(-1, 64)
-
     frames = np.arange(windows_frames)
-    return encode_frames(path, frames, encode, mirror=mirror, progress=lambda done: None)
+    plain = np.broadcast_to(frames[:, None], (windows_frames, 64))
+    return FeatureStore(np.stack([plain, -plain]).astype(np.float16), frames)
 
 
 def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(tmp_path):
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
-    latents = latents_of(91, tmp_path / "latents", mirror=True)
+    latents = latents_of(91)
     asked = settings(tmp_path, seed=3, mirror=True, decision_share=0.25, window_batch_size=64)
     batches = WindowBatches(windows, latents, SMALL_WORLD, asked)
     batch = batches.batch(5)
@@ -169,7 +165,7 @@ def _turn_about_z(states: torch.Tensor) -> torch.Tensor:
 
 def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
-    latents = latents_of(91, tmp_path / "latents", mirror=False)
+    latents = latents_of(91)
     model = WorldModel(SMALL_WORLD)
     for share, decides in ((0.0, False), (1.0, True)):
         batches = WindowBatches(
@@ -185,7 +181,7 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
 def test_scales_are_stored_on_the_device_of_the_model(tmp_path: Path) -> None:
     """Torch's meta device refuses tensors of another device, as a GPU does."""
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
-    latents = latents_of(91, tmp_path / "latents", mirror=True)
+    latents = latents_of(91)
     model = WorldModel(SMALL_WORLD).to("meta")
     set_scales(model, windows, latents, mirrors=True)
     assert model.change_std.is_meta
