@@ -6,16 +6,14 @@ keeps its bias and whose magnetometer is a million times too large, positions wi
 estimator has one.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
-from sitl.clock import NS_PER_MS, NS_PER_S, next_slot_ns
-from sitl.link.server import Endpoint
+from sitl.clock import NS_PER_MS, NS_PER_S, NS_PER_US, next_slot_ns
+from sitl.link.server import Endpoint, Stream
 from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
 from sitl.vehicle.rotation import Vec3
@@ -160,13 +158,6 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
 }
 
 
-@dataclass(slots=True, kw_only=True)
-class _Stream:
-    interval_ms: int
-    due_ns: int  # next slot on the stream's own grid
-    late_ns: int = 0  # delay of the next message after its slot
-
-
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
     """Link whose message intervals, in whole ms, are shared by all of its senders.
 
@@ -178,7 +169,6 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         super().__init__(ap, ArduPilotTelemetry(ap))
         self._conditions = ap.config.conditions
         self._random = np.random.Generator(np.random.PCG64((self._conditions.seed, 5)))
-        self._streams: dict[int, _Stream] = {}
         self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS)
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
@@ -198,7 +188,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             interval_ms = HEARTBEAT_INTERVAL_MS
         refusal = None
-        if message_id not in ArduPilotTelemetry.names:
+        if message_id not in self._telemetry.names:
             refusal = f"No ap_message for mavlink id ({message_id})"
         elif 0 < interval_ms < SHORTEST_INTERVAL_MS:
             refusal = f"Requested rate for message ID {message_id} too fast. "
@@ -218,27 +208,22 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
 
     def interval_us(self, message_id: int) -> int:
         """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
-        if message_id not in ArduPilotTelemetry.names:
-            return 0
-        stream = self._streams.get(message_id)
-        return stream.interval_ms * 1000 if stream else -1
+        return super().interval_us(message_id) if message_id in self._telemetry.names else 0
 
     def _due(self) -> list[int]:
         """Return the ids of the messages to send now; after missed slots, each is sent once."""
-        now_ns = self._ap.now_ns
-        ready = [
-            key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
-        ]
+        now_ns, ready = self._ap.now_ns, []
         slowdown = PARAM_SLOWDOWN if self._queued_params else 1
-        for message_id in ready:
-            stream = self._streams[message_id]
-            period_ns = self._period_ns(stream.interval_ms) * slowdown
-            stream.due_ns = next_slot_ns(stream.due_ns, period_ns, now_ns)
-            stream.late_ns = self._random_ns(self._conditions.stream_jitter_ms * NS_PER_MS)
+        for message_id, stream in self._streams.items():
+            if now_ns >= stream.due_ns + stream.late_ns:
+                period_ns = self._period_ns(stream.interval_us) * slowdown
+                stream.due_ns = next_slot_ns(stream.due_ns, period_ns, now_ns)
+                stream.late_ns = self._random_ns(self._conditions.stream_jitter_ms * NS_PER_MS)
+                ready.append(message_id)
         return ready
 
-    def _period_ns(self, interval_ms: int) -> int:
-        return (interval_ms + self._conditions.stream_slowdown_ms) * NS_PER_MS
+    def _period_ns(self, interval_us: int) -> int:
+        return interval_us * NS_PER_US + self._conditions.stream_slowdown_ms * NS_PER_MS
 
     def _random_ns(self, most_ns: float) -> int:
         return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
@@ -247,10 +232,10 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         self._streams.pop(message_id, None)
         if interval_ms > 0:
             # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
-            taken = {stream.interval_ms for stream in self._streams.values()}
-            if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
-                interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
-            period_ns = self._period_ns(interval_ms)
+            taken_ms = {stream.interval_us // 1000 for stream in self._streams.values()}
+            if interval_ms not in taken_ms and len(taken_ms) >= MAX_DISTINCT_INTERVALS:
+                interval_ms = min(taken_ms, key=lambda other: abs(other - interval_ms))
+            period_ns = self._period_ns(interval_ms * 1000)
             early_ns = self._random_ns(self._conditions.stream_phase_spread * period_ns)
             due_ns = self._ap.now_ns + period_ns - early_ns
-            self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
+            self._streams[message_id] = Stream(interval_us=interval_ms * 1000, due_ns=due_ns)

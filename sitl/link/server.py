@@ -7,7 +7,8 @@ commands, and decides which senders it obeys.
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -27,6 +28,16 @@ def by_message(**values: Value) -> dict[int, Value]:
     return {getattr(mav, f"MAVLINK_MSG_ID_{name}"): value for name, value in values.items()}
 
 
+@dataclass(slots=True, kw_only=True)
+class Stream:
+    """One streamed message of a link."""
+
+    interval_us: int
+    due_ns: int  # next slot
+    late_ns: int = 0  # ArduPilot: delay of the next message after its slot
+    version: Hashable = None  # PX4: version of the topic when last sent
+
+
 class Endpoint(ABC, Generic[Ap]):
     """Framing, messages by number and parameter list of one link during one boot.
 
@@ -43,6 +54,7 @@ class Endpoint(ABC, Generic[Ap]):
         self._outgoing = bytearray()
         self._telemetry = telemetry
         self._ap = ap
+        self._streams: dict[int, Stream] = {}
         self._text_id = 0
         self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
@@ -63,8 +75,10 @@ class Endpoint(ABC, Generic[Ap]):
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Change a stream. Return False if the firmware refuses."""
 
-    @abstractmethod
-    def interval_us(self, message_id: int) -> int: ...
+    def interval_us(self, message_id: int) -> int:
+        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
+        stream = self._streams.get(message_id)
+        return -1 if stream is None else stream.interval_us
 
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT; number the chunks of a long text."""

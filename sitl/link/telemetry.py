@@ -34,6 +34,7 @@ class Telemetry(Generic[Ap]):
 
     names: dict[int, str]
     """Methods by the number of their message."""
+    dialect: ClassVar[Any] = mav  # with all of these messages
     lat_deg: ClassVar[float]  # of the simulator's origin
     lon_deg: ClassVar[float]
     alt_m: ClassVar[float]  # above mean sea level
@@ -47,13 +48,13 @@ class Telemetry(Generic[Ap]):
         self.ap = ap
 
     def __init_subclass__(cls) -> None:
-        kinds = {name: getattr(mav, f"MAVLink_{name}_message", None) for name in dir(cls)}
+        kinds = {name: getattr(cls.dialect, f"MAVLink_{name}_message", None) for name in dir(cls)}
         cls.names = {kind.id: name for name, kind in kinds.items() if kind}
 
     def build(self, number: int) -> Message | None:
         """Return the message of this number, which must be known; None: nothing to report."""
         fields = getattr(self, self.names[number])()
-        kind = getattr(mav, f"MAVLink_{self.names[number]}_message")
+        kind = getattr(self.dialect, f"MAVLink_{self.names[number]}_message")
         return None if fields is None else kind(*fields)
 
     @property

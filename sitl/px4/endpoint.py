@@ -4,21 +4,20 @@ Each control step, a stream is sent if its interval has passed and its topic is 
 is late by less than half an interval keeps its grid; a later one starts a new grid. So 200 Hz of a
 250 Hz topic become 125 Hz, as measured.
 
-pymavlink's ardupilotmega dialect lacks EVENT(410) and CURRENT_MODE(436). They are packed here by
-their definitions in MAVLink's common and development sets.
+No dialect of pymavlink has EVENT(410), so it is packed here by its definition in MAVLink's common
+set.
 """
 
 import math
 import struct
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mav
+from pymavlink.dialects.v20 import development as mav
 
-from sitl.clock import NS_PER_MS
-from sitl.link.server import Endpoint, by_message
+from sitl.clock import NS_PER_MS, NS_PER_US
+from sitl.link.server import Endpoint, Stream, by_message
 from sitl.link.telemetry import Fields, Message, Telemetry
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
@@ -26,12 +25,9 @@ from sitl.px4.modes import Px4Mode
 from sitl.vehicle.config import Px4Release
 from sitl.vehicle.firmware import VelocitySetpoint
 
-CURRENT_MODE = 436
-EVENT = 410
-EVENT_CRC_EXTRA, CURRENT_MODE_CRC_EXTRA = 160, 193
-_EVENT = struct.Struct("<IIHBBB40s")
+CURRENT_MODE = mav.MAVLINK_MSG_ID_CURRENT_MODE
+_EVENT, _EVENT_CRC_EXTRA = struct.Struct("<IIHBBB40s"), 160
 _EVENT_LEVELS = 0x66  # for peers and for the vehicle's own log: info
-_CURRENT_MODE = struct.Struct("<IIB")
 
 _FIRMWARE_VERSIONS: dict[Px4Release, int] = {
     "1.14": 0x010E04FF,
@@ -44,22 +40,16 @@ _ESTIMATOR_WITHOUT_POSITION = 0xE5
 _ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
 
 
-class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has no types
-    """Message that the dialect lacks, given by number, payload and CRC seed."""
+class EventMessage(mav.MAVLink_message):  # type: ignore[misc]  # the library has no types
+    """EVENT(410), without arguments."""
 
-    def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
-        super().__init__(number, name)
-        self._hand_packed = payload
-        self._hand_crc_extra = crc_extra
+    def __init__(self, event: Event, sequence: int) -> None:
+        super().__init__(410, "EVENT")
+        head = (event.number, event.uptime_ms, sequence)
+        self._event = _EVENT.pack(*head, 0, 0, _EVENT_LEVELS, b"")
 
     def pack(self, sender: Message, force_mavlink1: bool = False) -> bytes:
-        packed = self._pack(sender, self._hand_crc_extra, self._hand_packed, force_mavlink1)
-        return bytes(packed)
-
-
-def event_message(event: Event, sequence: int) -> Message:
-    payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, _EVENT_LEVELS, b"")
-    return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
+        return bytes(self._pack(sender, _EVENT_CRC_EXTRA, self._event, force_mavlink1))
 
 
 class Px4Telemetry(Telemetry[Px4]):
@@ -69,18 +59,12 @@ class Px4Telemetry(Telemetry[Px4]):
     field_ned_gauss = (0.215, 0.0118, 0.4307)
     pressure_hpa, temperature_c = 955.6, 25.0
     capabilities = 0xE8FF
+    dialect = mav
 
     def __init__(self, ap: Px4) -> None:
         super().__init__(ap)
-        if ap.config.px4_release != "1.14":  # it came with 1.15 (upstream commit bb900264e0)
-            self.names = self.names | {CURRENT_MODE: "current_mode"}
-
-    def build(self, number: int) -> Message | None:
-        if number != CURRENT_MODE:
-            return super().build(number)
-        mode, intended = self.ap.mode, self.ap.intended
-        payload = _CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard)
-        return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
+        if ap.config.px4_release == "1.14":  # it came with 1.15 (upstream commit bb900264e0)
+            self.names = {key: name for key, name in self.names.items() if key != CURRENT_MODE}
 
     @property
     def version(self) -> int:
@@ -101,6 +85,10 @@ class Px4Telemetry(Telemetry[Px4]):
             status = mav.MAV_STATE_STANDBY if ap.can_arm() else mav.MAV_STATE_UNINIT
         kind = (mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_PX4)
         return (*kind, base_mode, ap.mode.custom_mode, status, 3)
+
+    def current_mode(self) -> Fields:
+        mode = self.ap.mode
+        return (mode.standard, mode.custom_mode, self.ap.intended.custom_mode)
 
     def sys_status(self) -> Fields:
         """PREARM_CHECK, never present, is healthy if health allows arming."""
@@ -196,7 +184,6 @@ def _at_rate(ap: Px4, period_ms: int) -> int:
     return ap.uptime_ns // (period_ms * NS_PER_MS)
 
 
-NS_PER_US = 1000
 HEARTBEAT_US = 1_000_000
 MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL has an int32
 
@@ -218,13 +205,6 @@ GCS_HZ: Mapping[int, float] = MappingProxyType(
 """Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
 
 
-@dataclass(slots=True, kw_only=True)
-class _Stream:
-    interval_us: int
-    sent_us: int
-    version: Hashable = None  # topic version when last sent
-
-
 class Px4Endpoint(Endpoint[Px4]):
     """Link to a ground station, or to a companion computer, which gets other streams."""
 
@@ -234,9 +214,8 @@ class Px4Endpoint(Endpoint[Px4]):
         self._event_sequence = 0
         super().__init__(ap, Px4Telemetry(ap))
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
-        before_us = ap.now_ns // NS_PER_US - HEARTBEAT_US  # the first one is sent at once
-        heartbeat = _Stream(interval_us=HEARTBEAT_US, sent_us=before_us)
-        self._streams = {mav.MAVLINK_MSG_ID_HEARTBEAT: heartbeat}
+        heartbeat = Stream(interval_us=HEARTBEAT_US, due_ns=ap.now_ns)  # the first one at once
+        self._streams[mav.MAVLINK_MSG_ID_HEARTBEAT] = heartbeat
         for message_id, interval_us in self._default_us.items():
             self._start(message_id, interval_us)
 
@@ -247,11 +226,6 @@ class Px4Endpoint(Endpoint[Px4]):
         self._start(message_id, interval_us or self._default_us.get(message_id, -1))
         return True
 
-    def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
-        stream = self._streams.get(message_id)
-        return -1 if stream is None else stream.interval_us
-
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT once a ground station is known."""
         if self.has_gcs:
@@ -259,27 +233,27 @@ class Px4Endpoint(Endpoint[Px4]):
 
     def send_event(self, event: Event) -> None:
         self._event_sequence = (self._event_sequence + 1) % 65536
-        self.send(event_message(event, self._event_sequence))
+        self.send(EventMessage(event, self._event_sequence))
 
     def _start(self, message_id: int, interval_us: int) -> None:
         if interval_us < 0:
             self._streams.pop(message_id, None)
         else:
-            sent_us = self._ap.now_ns // NS_PER_US
             interval_us = min(interval_us, MAX_INTERVAL_US)
-            self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
+            due_ns = self._ap.now_ns + interval_us * NS_PER_US
+            self._streams[message_id] = Stream(interval_us=interval_us, due_ns=due_ns)
 
     def _due(self) -> list[int]:
         """Return the ids of the messages whose interval has passed and whose topic is new."""
-        now_us, ready = self._ap.now_ns // NS_PER_US, []
+        now_ns, ready = self._ap.now_ns, []
         for message_id, stream in self._streams.items():
-            interval_us = stream.interval_us
-            if now_us - stream.sent_us < interval_us:
+            if now_ns < stream.due_ns:
                 continue
             if (version := topic_version(message_id, self._ap)) == stream.version:
                 continue
-            is_on_grid = now_us - stream.sent_us < 1.5 * interval_us
-            stream.sent_us = stream.sent_us + interval_us if is_on_grid else now_us
+            interval_ns = stream.interval_us * NS_PER_US
+            is_on_grid = now_ns - stream.due_ns < interval_ns / 2
+            stream.due_ns = (stream.due_ns if is_on_grid else now_ns) + interval_ns
             stream.version = version
             ready.append(message_id)
         return ready
