@@ -5,15 +5,7 @@ from collections.abc import Sequence
 import pygame
 
 from sitl.clock import Clock
-from sitl.pilot.transmitter import (
-    OFF_US,
-    Gesture,
-    Hand,
-    PadAxes,
-    Switch,
-    Transmitter,
-    pad_sticks,
-)
+from sitl.pilot.transmitter import ARM, DISARM, Hand, PadAxes, Switch, Transmitter, pad_sticks
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
 """A, B, back and start on a common pad."""
@@ -63,38 +55,35 @@ class PygamePad:
         )
 
 
-class GamepadPilot:
-    """`Pilot` at a gamepad: its transmitter, gestures and switch.
+class GamepadPilot(Transmitter):
+    """`Pilot` at a gamepad: its sticks, gestures and switch.
 
     Without the pad the receiver has no signal.
     """
 
     def __init__(self, pad: PygamePad, axes: PadAxes, clock: Clock) -> None:
+        super().__init__(clock.now_ns)
         self._pad = pad
         self._axes = axes
-        self._clock = clock
-        self._transmitter = Transmitter(clock.now_ns())
         self._switch: Switch = "low"
         self._down: set[int] = set()
 
-    def latest(self) -> Sequence[int] | None:
-        now_ns = self._clock.now_ns()
-        if not self._transmitter.begins_frame(now_ns):
-            return None
+    def _hand(self, now_ns: int) -> Hand | None:
         if not self._pad.poll():
             self._down = set()
-            return OFF_US
+            return None
         before, self._down = self._down, self._pad.pressed()
         for number in self._down - before:
             if number == RECORD_BUTTON:
                 self._switch = "low" if self._switch == "high" else "high"
             elif number == BAD_BUTTON:
                 self._switch = "middle"
-        gesture: Gesture | None = "arm" if ARM_BUTTON in self._down else None
-        if gesture is None and DISARM_BUTTON in self._down:
-            gesture = "disarm"
-        hand = Hand(pad_sticks(self._axes, self._pad.axes()), gesture, self._switch)
-        return self._transmitter.channels_us(hand, now_ns)
+        sticks = pad_sticks(self._axes, self._pad.axes())
+        if DISARM_BUTTON in self._down:
+            sticks = DISARM
+        if ARM_BUTTON in self._down:
+            sticks = ARM
+        return Hand(sticks, self._switch)
 
     def close(self) -> None:
         pygame.quit()

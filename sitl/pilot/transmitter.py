@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from sitl import UsageError
@@ -14,7 +15,9 @@ from sitl.simulated_vehicle import SimulatedVehicle
 
 OFF_US = (0,) * 8  # no signal from the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
-GESTURE_THROTTLE, GESTURE_YAW = -1.0, 1.0
+IDLE, DESCENT = (CENTRED._replace(throttle=throttle) for throttle in (-1.0, -0.8))
+ARM, DISARM = IDLE._replace(yaw=1.0), IDLE._replace(yaw=-1.0)
+"""Gestures that both firmwares understand."""
 _SWITCH_US = {"low": 1000, "middle": 1500, "high": 2000}
 _FIRST_MODE_US, _MODE_US = 1100, 1500
 """The mode switch moves once after the start, because ArduPilot ignores its position until it
@@ -22,15 +25,12 @@ moves. At 1500 us the simulated vehicle is in ALT_HOLD."""
 _MODE_AFTER_NS = NS_PER_S
 
 Switch = Literal["low", "middle", "high"]
-Gesture = Literal["arm", "disarm"]
 
 
 class Hand(NamedTuple):
-    """Sticks, gesture and switch of the pilot."""
+    """Sticks and switch of the pilot."""
 
     sticks: StickPositions = CENTRED
-    gesture: Gesture | None = None
-    """Replaces ``sticks``: throttle down with full right yaw to arm, full left yaw to disarm."""
     switch: Switch = "low"
 
 
@@ -43,31 +43,36 @@ class Pilot(Protocol):
     def close(self) -> None: ...
 
 
-class Transmitter:
-    """Converts a hand to channels at a receiver's frame rate, and moves the mode switch."""
+class Transmitter(ABC):
+    """`Pilot` that converts a hand to channels at a receiver's frame rate."""
 
-    def __init__(self, start_ns: int) -> None:
-        self._start_ns = start_ns
-        self._due_ns = start_ns
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self._start_ns = self._due_ns = now_ns()
 
-    def begins_frame(self, now_ns: int) -> bool:
-        """Return True once for each frame, when it is due."""
+    @abstractmethod
+    def _hand(self, now_ns: int) -> Hand | None:
+        """Return the pilot's hand for the next frame; None: no signal."""
+
+    def latest(self) -> Sequence[int] | None:
+        """Return the channels once for each frame: roll, pitch, throttle, yaw, mode, unused,
+        switch, unused."""
+        now_ns = self._now_ns()
         if now_ns < self._due_ns:
-            return False
+            return None
         is_on_time = now_ns - self._due_ns < PERIOD_NS
         self._due_ns = (self._due_ns if is_on_time else now_ns) + PERIOD_NS
-        return True
-
-    def channels_us(self, hand: Hand, now_ns: int) -> tuple[int, ...]:
-        """Return the channels: roll, pitch, throttle, yaw, mode, unused, switch, unused."""
+        if (hand := self._hand(now_ns)) is None:
+            return OFF_US
         throttle, yaw, pitch, roll = hand.sticks
-        if hand.gesture is not None:
-            side = GESTURE_YAW if hand.gesture == "arm" else -GESTURE_YAW
-            throttle, yaw, pitch, roll = GESTURE_THROTTLE, side, 0.0, 0.0
         is_begun = now_ns - self._start_ns < _MODE_AFTER_NS
         mode_us = _FIRST_MODE_US if is_begun else _MODE_US
         sticks = (_us(roll), _us(-pitch), _us(throttle), _us(yaw))
         return (*sticks, mode_us, 1500, _SWITCH_US[hand.switch], 1500)
+
+    def close(self) -> None:
+        """Stop the input device, if any."""
+        return
 
 
 def _us(position: float) -> int:
@@ -117,56 +122,32 @@ WAIT_NS = 8 * NS_PER_S
 """Time from boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
 position, and a recorder requests parameters and streams."""
 HOVER_NS = 2 * NS_PER_S  # after the last gate, before the landing
-IDLE = CENTRED._replace(throttle=-1.0)
-DESCENT = CENTRED._replace(throttle=-0.8)
 
 
-class ExpertPilot:
-    """`Pilot` for one flight of the expert over the course."""
+class ExpertPilot(Transmitter):
+    """One flight of the expert over the course, with the switch high up to the last gate."""
 
     def __init__(self, vehicle: SimulatedVehicle, course: Course, *, speed_mps: float) -> None:
+        super().__init__(lambda: vehicle.ap.now_ns)
         self._vehicle = vehicle
         self._guide = CourseGuide(course, STICK_AGILITY, speed_mps)
-        self._start_ns = vehicle.ap.now_ns
-        self._transmitter = Transmitter(self._start_ns)
-        self._phase: Literal["waiting", "flying", "landing", "over"] = "waiting"
+        self._was_armed = False
         self._over_course_ns: int | None = None
-
-    def latest(self) -> Sequence[int] | None:
-        now_ns = self._vehicle.ap.now_ns
-        if not self._transmitter.begins_frame(now_ns):
-            return None
-        return self._transmitter.channels_us(self._hand(now_ns), now_ns)
 
     def _hand(self, now_ns: int) -> Hand:
         ap = self._vehicle.ap
-        if self._phase == "waiting":
-            if ap.armed:
-                self._phase = "flying"
-            elif now_ns - self._start_ns >= WAIT_NS:
-                return Hand(IDLE, gesture="arm")
-            return Hand(IDLE)
         if not ap.armed:
-            self._phase = "over"
-            return Hand(IDLE)
-        if self._phase == "flying":
-            return Hand(self._fly(now_ns), switch=self._switch)
-        return Hand(DESCENT, gesture="disarm" if ap.landed else None)
-
-    @property
-    def _switch(self) -> Switch:
-        return "high" if self._over_course_ns is None else "low"
-
-    def _fly(self, now_ns: int) -> StickPositions:
-        sticks = expert_sticks(self._guide, self._vehicle.ap.truth, now_ns / NS_PER_S)
-        if self._guide.next_gate is None:
-            if self._over_course_ns is None:
-                self._over_course_ns = now_ns
-            if now_ns - self._over_course_ns >= HOVER_NS:
-                self._phase = "landing"
-        return sticks
-
-    def close(self) -> None: ...
+            is_waiting = self._was_armed or now_ns - self._start_ns < WAIT_NS
+            return Hand(IDLE if is_waiting else ARM)
+        self._was_armed = True
+        sticks = expert_sticks(self._guide, ap.truth, now_ns / NS_PER_S)
+        if self._guide.next_gate is not None:
+            return Hand(sticks, switch="high")
+        if self._over_course_ns is None:
+            self._over_course_ns = now_ns
+        if now_ns - self._over_course_ns < HOVER_NS:
+            return Hand(sticks)
+        return Hand(DISARM if ap.landed else DESCENT)
 
 
 PilotName = Literal["gamepad", "expert"]

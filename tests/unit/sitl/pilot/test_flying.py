@@ -8,8 +8,10 @@ from sitl.clock import NS_PER_S, Clock
 from sitl.course import make_course
 from sitl.pilot.demonstrator import CENTRED
 from sitl.pilot.transmitter import (
+    ARM,
     DEFAULT_AXES,
-    OFF_US,
+    DISARM,
+    IDLE,
     Hand,
     Transmitter,
     make_pilot,
@@ -19,7 +21,7 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 COURSE = make_course(5)
-DOWN = Hand(CENTRED._replace(throttle=-1.0))
+DOWN = Hand(IDLE)
 
 
 def vehicle_of(autopilot, **changes):
@@ -34,19 +36,21 @@ def pilot_of(name, vehicle, axes=DEFAULT_AXES):
     return pilot
 
 
-class Flight:
+class Flight(Transmitter):
     """Holds a hand on the transmitter."""
 
     def __init__(self, vehicle):
-        self.vehicle = vehicle
-        self.transmitter = Transmitter(0)
-        self.now_ns = 0
+        self.vehicle, self.now_ns, self.hand = vehicle, 0, None
+        super().__init__(lambda: self.now_ns)
+
+    def _hand(self, now_ns):
+        return self.hand
 
     def hold(self, hand, seconds):
+        self.hand = hand
         for _ in range(round(seconds * NS_PER_S / STEP_NS)):
             self.now_ns += STEP_NS
-            if self.transmitter.begins_frame(self.now_ns):
-                us = OFF_US if hand is None else self.transmitter.channels_us(hand, self.now_ns)
+            if (us := self.latest()) is not None:
                 self.vehicle.set_receiver(us)
             self.vehicle.step(self.now_ns)
 
@@ -57,7 +61,7 @@ def flown(autopilot, mode=None):
     flight.hold(DOWN, 7)
     assert not flight.vehicle.ap.armed
     assert mode in (None, flight.vehicle.ap.mode_name)
-    flight.hold(Hand(gesture="arm"), 3)
+    flight.hold(Hand(ARM), 3)
     assert flight.vehicle.ap.armed
     flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
     return flight
@@ -72,11 +76,11 @@ def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, 
     assert not vehicle.ap.landed
     flight.hold(Hand(CENTRED._replace(pitch=0.4)), 2)
     assert vehicle.ap.truth.velocity_ned_mps[0] > 1.0, "nose down flies forward, north"
-    flight.hold(Hand(gesture="disarm"), 1.5)
+    flight.hold(Hand(DISARM), 1.5)
     assert vehicle.ap.armed, "not in the air"
     flight.hold(DOWN, 8)
     assert vehicle.ap.landed
-    flight.hold(Hand(gesture="disarm"), 3)
+    flight.hold(Hand(DISARM), 3)
     assert not vehicle.ap.armed
 
 
