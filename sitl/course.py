@@ -7,12 +7,22 @@ square opening; ``yaw_rad`` is the heading in which it must be flown through (0 
 import cmath
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from sitl import UsageError
-from sitl.vehicle.rotation import Quat, Vec3, conjugate, horizontal, rotate, to_euler, wrap_pi
+from sitl.vehicle.rotation import (
+    Quat,
+    Vec3,
+    conjugate,
+    horizontal,
+    minus,
+    rotate,
+    wrap_pi,
+    yaw_of,
+)
 
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
@@ -79,9 +89,7 @@ class Gate:
 
     def offset_m(self, position_ned_m: Vec3) -> Vec3:
         """Return the position relative to the gate's centre in gate axes: forward, right, down."""
-        north_m, east_m, down_m = position_ned_m
-        center_n, center_e, center_d = self.center_ned_m
-        return self.to_axes((north_m - center_n, east_m - center_e, down_m - center_d))
+        return self.to_axes(minus(position_ned_m, self.center_ned_m))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,26 +145,16 @@ def make_course(seed: int, laps: int = 1) -> Course:
     legs_m = random.uniform(*family.leg_m, family.gate_count)
     climbs_m = random.uniform(-family.climb_m, family.climb_m, family.gate_count)
 
-    north_m = east_m = heading_rad = 0.0
+    at_m, heading_rad = 0j, 0.0
     altitude_m = float(random.uniform(*family.first_altitude_m))
-    gates = []
-    for index in range(family.gate_count):
-        leg_m = family.first_leg_m if index == 0 else float(legs_m[index])
-        north_m += leg_m * math.cos(heading_rad)
-        east_m += leg_m * math.sin(heading_rad)
+    places: list[tuple[complex, float, float]] = []
+    for index, turn_rad in enumerate(turns_rad.tolist()):
+        at_m += cmath.rect(float(legs_m[index]) if index else family.first_leg_m, heading_rad)
         if index > 0:
             altitude_m = float(np.clip(altitude_m + climbs_m[index], *family.altitude_m))
-        turn_rad = float(turns_rad[index])
-        gates.append(
-            Gate(
-                center_ned_m=(north_m, east_m, -altitude_m),
-                yaw_rad=wrap_pi(heading_rad + turn_rad / 2),
-                size_m=OPENING_M,
-                index=index,
-            )
-        )
+        places.append((at_m, altitude_m, heading_rad + turn_rad / 2))
         heading_rad += turn_rad
-    return Course(seed=seed, gates=tuple(gates))
+    return Course(seed=seed, gates=_gates(places))
 
 
 def _make_loop(seed: int, laps: int) -> Course:
@@ -171,19 +169,25 @@ def _make_loop(seed: int, laps: int) -> Course:
     in_rad = [cmath.phase(point - points[k - 1]) for k, point in enumerate(points)]
     out_rad = [*in_rad[1:], in_rad[0]]
     through_rad = [out - wrap_pi(out - come) / 2 for come, out in zip(in_rad, out_rad, strict=True)]
-    gates = []
-    for k, point in enumerate(points):
-        # The first gate stands north of the start and is flown northwards.
-        at_m = (point - points[0]) * cmath.rect(1.0, -through_rad[0]) + LOOP_FIRST_LEG_M
-        gates.append(
-            Gate(
-                center_ned_m=(at_m.real, at_m.imag, -altitude_m[k]),
-                yaw_rad=wrap_pi(through_rad[k] - through_rad[0]),
-                size_m=OPENING_M,
-                index=k,
-            )
+    # The first gate stands north of the start and is flown northwards.
+    turn = cmath.rect(1.0, -through_rad[0])
+    at_m = [(point - points[0]) * turn + LOOP_FIRST_LEG_M for point in points]
+    yaw_rad = [through - through_rad[0] for through in through_rad]
+    gates = _gates(zip(at_m, altitude_m, yaw_rad, strict=True))
+    return Course(seed=seed, gates=gates, laps=laps, is_loop=True)
+
+
+def _gates(places: Iterable[tuple[complex, float, float]]) -> tuple[Gate, ...]:
+    """Return gates at north + 1j * east, height [m] and heading [rad]."""
+    return tuple(
+        Gate(
+            center_ned_m=(at_m.real, at_m.imag, -altitude_m),
+            yaw_rad=wrap_pi(yaw_rad),
+            size_m=OPENING_M,
+            index=index,
         )
-    return Course(seed=seed, gates=tuple(gates), laps=laps, is_loop=True)
+        for index, (at_m, altitude_m, yaw_rad) in enumerate(places)
+    )
 
 
 def course_to_json(course: Course) -> str:
@@ -216,18 +220,14 @@ def gate_truth(
     if next_gate is None:
         return GateTruth()
     body_from_ned = conjugate(ned_from_body_wxyz)
-    centers_body_m = []
     ahead = course.ahead(next_gate, 2)
-    for gate in ahead:
-        north_m, east_m, down_m = (
-            center - own for center, own in zip(gate.center_ned_m, position_ned_m, strict=True)
-        )
-        centers_body_m.append(rotate(body_from_ned, (north_m, east_m, down_m)))
-    _, _, yaw_rad = to_euler(ned_from_body_wxyz)
+    centers_body_m = [
+        rotate(body_from_ned, minus(gate.center_ned_m, position_ned_m)) for gate in ahead
+    ]
     return GateTruth(
         next_gate=next_gate,
         gate_body_m=centers_body_m[0],
-        gate_yaw_rad=wrap_pi(ahead[0].yaw_rad - yaw_rad),
+        gate_yaw_rad=wrap_pi(ahead[0].yaw_rad - yaw_of(ned_from_body_wxyz)),
         gate_after_body_m=centers_body_m[1] if len(centers_body_m) > 1 else None,
     )
 

@@ -30,11 +30,11 @@ FloatArray = NDArray[np.float64]
 
 
 class Part(NamedTuple):
-    """One convex or flat part of an object."""
+    """One convex or flat part of an object: quadrilaterals."""
 
-    corners_m: FloatArray  # [N, 4, 3]: north, east, down
+    corners_m: FloatArray  # [N, 4, 3]: north, east, down, or axes of the object
     normals: FloatArray  # [N, 3] towards the visible side; zero = visible from both sides
-    rgb: Rgb  # not lit
+    rgb: Rgb | FloatArray  # [3] or [N, 3], not lit
 
 
 def clutter(course: Course, conditions: Conditions) -> list[Part]:

@@ -3,13 +3,13 @@
 import cmath
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sitl.camera.clutter import clutter
+from sitl.camera.clutter import Part, clutter
 from sitl.course import BAR_M, DEPTH_M, Course, Gate
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 from sitl.vehicle.rotation import Vec3, wrap_pi
@@ -47,14 +47,6 @@ BACKDROP_RISES = (-1.0, -0.30, -0.05, 0.0, 0.10, 0.40, 1.0)
 """Rise of a viewing ray of unit depth for each colour of far ground, then sky; interpolated."""
 
 
-class _Face(NamedTuple):
-    """One quadrilateral in gate axes: forward through the gate, right, down."""
-
-    corners_m: ArrayLike
-    normal: ArrayLike  # towards the visible side; zero = visible from both sides
-    rgb: ArrayLike
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faces:
     """Flat quadrilaterals in world coordinates."""
@@ -75,46 +67,53 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
 
     A stray gate has the shading of the course's gate with the same number.
     """
-    sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
-
-    def light_on(normal_ned: FloatArray) -> float:
-        return ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
-
     random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
     is_shaded = random.random(len(course.gates)) < conditions.shaded_gates
     is_hidden = random.random(len(course.gates)) < conditions.hidden_gates
     gates = [*course.gates, *_stray_gates(course, conditions)]
-    faces: list[tuple[FloatArray, FloatArray, FloatArray, int]] = []  # as the fields of Faces
-    centers = [gate.center_ned_m for gate in gates]
+    centers: list[ArrayLike] = [gate.center_ned_m for gate in gates]
+    shown: list[tuple[int, Part]] = []  # each with its row in ``centers``
     for owner, gate in enumerate(gates):
-        cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
-        ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
-        for face in _faces_of(gate, conditions):
-            normal_ned = ned_from_gate @ np.array(face.normal)
-            light = light_on(normal_ned) * (SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0)
-            corners_m = np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m
-            faces.append((corners_m, normal_ned, np.array(face.rgb) * light, owner))
-        if is_hidden[gate.index] and owner < len(course.gates):
-            ahead_m, aside_m = -random.uniform(*PANEL_AHEAD_M), random.uniform(*PANEL_ASIDE_M)
-            aside_m *= random.choice((-1.0, 1.0))
-            down_m = (-gate.size_m, -gate.center_ned_m[2])
-            panel_m = np.array(_upright(ahead_m, aside_m, PANEL_WIDTH_M, down_m))
-            corners_m = panel_m @ ned_from_gate.T + gate.center_ned_m
-            rgb = tinted(PANEL_RGB, conditions.ground_tint)
-            faces.append((corners_m, np.array(BOTH_SIDES), rgb, len(centers)))
-            centers.append(tuple(corners_m.mean(axis=0).tolist()))
-    for part in clutter(course, conditions):
-        for corners_m, normal in zip(part.corners_m, part.normals, strict=True):
-            faces.append((corners_m, normal, np.array(part.rgb) * light_on(normal), len(centers)))
-        centers.append(tuple(part.corners_m.mean(axis=(0, 1)).tolist()))
-    corners, normals, colours, owners = map(np.array, zip(*faces, strict=True))
+        brightness = SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0
+        parts = (_placed(part, gate) for part in _gate_parts(gate, conditions))
+        shown += [(owner, _lit(part, conditions, brightness)) for part in parts]
+    hidden = [gate for gate in course.gates if is_hidden[gate.index]]
+    objects = [_placed(_panel(gate, conditions, random), gate) for gate in hidden]
+    objects += [_lit(part, conditions) for part in clutter(course, conditions)]
+    for part in objects:
+        shown.append((len(centers), part))
+        centers.append(part.corners_m.mean(axis=(0, 1)))
     return Faces(
-        corners_ned_m=corners,
-        normals_ned=normals,
-        rgb=colours,
-        owner=owners,
+        corners_ned_m=np.concatenate([part.corners_m for _, part in shown]),
+        normals_ned=np.concatenate([part.normals for _, part in shown]),
+        rgb=np.concatenate([part.rgb for _, part in shown]),
+        owner=np.repeat([row for row, _ in shown], [len(part.normals) for _, part in shown]),
         centers_ned_m=np.array(centers),
     )
+
+
+def _placed(part: Part, gate: Gate) -> Part:
+    """Return a part in NED that is given in the gate's axes: forward, right, down."""
+    cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
+    ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+    corners_m = part.corners_m @ ned_from_gate.T + gate.center_ned_m
+    return Part(corners_m, part.normals @ ned_from_gate.T, part.rgb)
+
+
+def _lit(part: Part, conditions: Conditions, brightness: float = 1.0) -> Part:
+    """Return the part with the colours that the sun gives to each of its faces."""
+    sun = np.maximum(0.0, part.normals @ np.array(conditions.sun_ned))
+    light = (conditions.ambient + (1 - conditions.ambient) * sun) * brightness
+    return part._replace(rgb=np.array(part.rgb) * light[:, None])
+
+
+def _panel(gate: Gate, conditions: Conditions, random: np.random.Generator) -> Part:
+    """Return a panel before the gate, beside the passage; the sun does not light it."""
+    ahead_m, aside_m = -random.uniform(*PANEL_AHEAD_M), random.uniform(*PANEL_ASIDE_M)
+    aside_m *= random.choice((-1.0, 1.0))
+    down_m = (-gate.size_m, -gate.center_ned_m[2])
+    rgb = tinted(PANEL_RGB, conditions.ground_tint)
+    return _upright(ahead_m, aside_m, PANEL_WIDTH_M, down_m, BOTH_SIDES, rgb[None])
 
 
 def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
@@ -140,8 +139,8 @@ def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
     return strays
 
 
-def _faces_of(gate: Gate, look: Conditions) -> list[_Face]:
-    """Return the faces in drawing order: posts, inner walls, outer walls, back, front, number.
+def _gate_parts(gate: Gate, look: Conditions) -> list[Part]:
+    """Return the parts in drawing order: posts, inner walls, outer walls, back, front, number.
 
     The walls inside the opening come first, since any other part of the frame may hide them. Two
     visible faces among the outer walls and rings never hide each other.
@@ -159,35 +158,35 @@ def _faces_of(gate: Gate, look: Conditions) -> list[_Face]:
     back, front = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
     return [
         *(
-            _Face(_upright(0.0, m, look.leg_m, to_ground_m), BOTH_SIDES, look.leg_rgb)
+            _upright(0.0, m, look.leg_m, to_ground_m, BOTH_SIDES, look.leg_rgb)
             for m in (-middle_m, middle_m)
             if look.leg_m
         ),
-        *_ring((-half_m, inner_m), (half_m, inner_m), (0.0, 0.0, 1.0), inside),
-        *_ring((-half_m, outer_m), (half_m, outer_m), (0.0, 0.0, -1.0), inside),
-        *_ring((half_m, outer_m), (half_m, inner_m), back, backs),
-        *_ring((-half_m, outer_m), (-half_m, inner_m), front, paints),
-        *(_Face(_upright(-half_m, m, look.pip_m, number_m), front, look.pip_rgb) for m in pips),
+        _ring((-half_m, inner_m), (half_m, inner_m), (0.0, 0.0, 1.0), inside),
+        _ring((-half_m, outer_m), (half_m, outer_m), (0.0, 0.0, -1.0), inside),
+        _ring((half_m, outer_m), (half_m, inner_m), back, backs),
+        _ring((-half_m, outer_m), (-half_m, inner_m), front, paints),
+        *(_upright(-half_m, m, look.pip_m, number_m, front, look.pip_rgb) for m in pips),
     ]
 
 
 def _upright(
-    forward_m: float, middle_m: float, width_m: float, down_m: tuple[float, float]
-) -> tuple[Vec3, ...]:
-    """Return the corners of a rectangle across the passage."""
-    left_m, right_m = middle_m - width_m / 2, middle_m + width_m / 2
-    top_m, bottom_m = down_m
-    return (
-        (forward_m, left_m, top_m),
-        (forward_m, right_m, top_m),
-        (forward_m, right_m, bottom_m),
-        (forward_m, left_m, bottom_m),
-    )
+    forward_m: float,
+    middle_m: float,
+    width_m: float,
+    down_m: tuple[float, float],
+    normal: Vec3,
+    rgb: Rgb | FloatArray,
+) -> Part:
+    """Return a rectangle across the passage."""
+    corners = ((0, -1), (0, 1), (1, 1), (1, -1))
+    corners_m = [(forward_m, middle_m + side * width_m / 2, down_m[k]) for k, side in corners]
+    return Part(np.array([corners_m]), np.array([normal]), rgb)
 
 
 def _ring(
     one: tuple[float, float], other: tuple[float, float], top_normal: Vec3, paints: FloatArray
-) -> list[_Face]:
+) -> Part:
     """Return the four faces between two squares around the passage's axis, the top one first.
 
     A square is given by its place along the passage and half its side. ``paints`` [2, 3] is the
@@ -202,11 +201,8 @@ def _ring(
             (other_m, -other_half_m, -other_half_m),
         ]
     )
-    turns = [np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)]
-    return [
-        _Face(top_m @ turn, np.array(top_normal) @ turn, paints[k % 2])
-        for k, turn in enumerate(turns)
-    ]
+    turns = np.stack([np.linalg.matrix_power(_QUARTER_TURN, k) for k in range(4)])
+    return Part(top_m @ turns, np.array(top_normal) @ turns, np.tile(paints, (2, 1)))
 
 
 def ridge_directions(seed: int) -> FloatArray:
