@@ -90,7 +90,7 @@ docs: $(VENV)/documents  ## the documentation as a site in out/site; warnings ar
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, a flight and the link here, beside eager torch and peers
-	$(BIN)/python -m benchmarks.compare --json out/bench.json --check benchmarks/budget.json
+	$(BIN)/python -m benchmarks.compare --json out/bench.json
 
 mutants: $(VENV)/installed  ## small changes of the safety core, each of which a test must notice; not part of test
 	PYTHONPATH=.:tests $(BIN)/python -m mutation $(MODULES) $(if $(ONLY),--only $(ONLY))

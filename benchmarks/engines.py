@@ -82,16 +82,10 @@ def _timing(policy: str, work: str, engine: str, durations: Histogram) -> Engine
 
 
 def engine_table(timings: Iterable[EngineTiming]) -> Table:
-    """Return a table with a row for each piece of work and a column for each engine."""
-    cells = {
-        (one.policy, one.work, one.engine): f"{one.p50_ms:.2f} / {one.p99_ms:.2f}"
-        for one in timings
-    }
-    engines = tuple(dict.fromkeys(engine for _, _, engine in cells))
-    works = tuple(dict.fromkeys((policy, work) for policy, work, _ in cells))
+    """Return a table with a row for each piece of work on each engine."""
     rows = [
-        (policy, work, *(cells.get((policy, work, engine), "-") for engine in engines))
-        for policy, work in works
+        (one.policy, one.work, one.engine, f"{one.p50_ms:.2f} / {one.p99_ms:.2f}")
+        for one in timings
     ]
     title = "Inference on one thread, ms (p50 / p99)"
-    return make_table(title, ("policy", "work", *engines), rows, left_columns=2)
+    return make_table(title, ("policy", "work", "engine", "time"), rows, left_columns=3)

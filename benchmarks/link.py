@@ -18,11 +18,10 @@ from rich.text import Text
 from benchmarks.link_vehicle import ATTITUDE_HZ, CONNECT_S, LinkLatency
 from mavbridge.commands.output import make_table, print_status, table_console
 from mavbridge.core.errors import UserError
-from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, running
+from mavbridge.core.processes import IMPORT_ROOT, child_environment, free_port, log_tail, running
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.observe.terminal import number
 
-LINK_VEHICLE = "benchmarks.link_vehicle"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
 STARTING_S = 15.0
 """Time for imports [s], in addition to the vehicle's time for a client to connect."""
@@ -85,16 +84,6 @@ def link_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
     return (OUR_CLIENT, BARE_CLIENT), (note,)
 
 
-def _wait(vehicle: "subprocess.Popen[bytes]", log: Path, timeout_s: float) -> None:
-    """Wait for the vehicle to end; raise UserError with the end of its log if it fails to."""
-    try:
-        status = vehicle.wait(timeout_s)
-    except subprocess.TimeoutExpired as error:
-        raise UserError(f"the vehicle did not end in {timeout_s:g} s: {log_tail(log)}") from error
-    if status != 0:
-        raise UserError(f"the vehicle failed with status {status}: {log_tail(log)}")
-
-
 def link_table(links: Iterable[LinkLatency]) -> Table:
     """Return a table with a row for each client."""
     rows = []
@@ -111,33 +100,28 @@ def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
     """Time one client.
 
     Raises:
-        UserError: the client or the vehicle failed; quotes the end of both logs.
+        UserError: the client or the vehicle failed; quotes the end of the client's log.
     """
     print_status(f"link: {client.name}")
     port = str(free_port())
     timeout_s = STARTING_S + CONNECT_S + 1.1 * attitudes / ATTITUDE_HZ
-    with TemporaryDirectory(prefix="mavbridge-bench-") as name:
-        folder = Path(name)
-        log, vehicle_log, answers = (folder / file for file in ("client", "vehicle", "answers"))
-        client_command = [word.format(port=port) for word in client.command]
-        vehicle_command = (
-            *(sys.executable, "-m", LINK_VEHICLE, "--port", port),
-            *("--attitudes", str(attitudes), "--out", str(answers)),
-        )
-        with (
-            running(*client_command, log=log) as process,
-            running(*vehicle_command, log=vehicle_log) as vehicle,
-        ):
+    vehicle = (sys.executable, "-m", "benchmarks.link_vehicle", "--port", port)
+    with TemporaryDirectory(prefix="mavbridge-bench-") as folder:
+        log = Path(folder) / "client"
+        with running(*(word.format(port=port) for word in client.command), log=log):
             try:
-                _wait(vehicle, vehicle_log, timeout_s)
-            except UserError as error:
+                timed = subprocess.run(
+                    (*vehicle, "--attitudes", str(attitudes)),
+                    check=True,
+                    stdout=subprocess.PIPE,
+                    env=child_environment(),
+                    timeout=timeout_s,
+                )
+            except subprocess.SubprocessError as error:
                 raise UserError(f"{client.name}: {error}\nits log: {log_tail(log)}") from error
-            end(process)
-        counted = json.loads(answers.read_text())
-        if (trip := counted["round_trip_ms"]) is None:
-            raise UserError(f"{client.name} answered no attitude; its log: {log_tail(log)}")
-        figures = {"client": client.name, "round_trip_ms": Percentiles(**trip)}
-        return LinkLatency(**counted | figures)
+    figures = json.loads(timed.stdout)
+    trip = figures["round_trip_ms"] and Percentiles(**figures["round_trip_ms"])
+    return LinkLatency(**figures | {"client": client.name, "round_trip_ms": trip})
 
 
 if __name__ == "__main__":

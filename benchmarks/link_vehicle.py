@@ -9,9 +9,10 @@ figures.
 """
 
 import json
+import sys
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import count
-from pathlib import Path
 
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -32,11 +33,9 @@ CODES = 200
 CODE_SPAN = 100
 CODE_US = 5
 """PWM step per code: code k is a stick of (k - 100) / 100, which is 1000 + 5 k us. An answer may be
-off by 2 us."""
+off by 2 us. The codes repeat after 2 s; an answer that has not come by then is lost."""
 WARM_ANSWERS = 100
 CONNECT_S = 30.0
-PENDING_LIMIT = 150
-"""Largest number of pending answers (1.5 s); older ones count as lost. Smaller than CODES."""
 READY_NS = 10 * NS_PER_S
 """Age of the vehicle at the start: its estimator has a position."""
 STREAM_US = 10_000
@@ -52,25 +51,13 @@ app = App(help=__doc__)
 
 
 @app.default
-def main(*, port: int, attitudes: int, out: Path) -> None:
-    """Send ``attitudes`` to a client that listens on a UDP port, and write the figures."""
+def main(*, port: int, attitudes: int) -> None:
+    """Send ``attitudes`` to a client that listens on a UDP port, and print the figures as JSON."""
     clock = MonotonicClock()
     transport = UdpTransport(("127.0.0.1", port), clock, listen=False)
     transport.open()
-    try:
-        out.write_text(json.dumps(asdict(LinkVehicle(transport, clock).run(attitudes))))
-    finally:
-        transport.close()
-
-
-def stick_of(code: int) -> float:
-    """Return the stick for a code, in [-1, 1)."""
-    return (code - CODE_SPAN) / CODE_SPAN
-
-
-def code_of_pwm(pwm_us: int) -> int:
-    """Return the code in the pulse width of the roll stick."""
-    return round((pwm_us - 1000) / CODE_US)
+    with closing(transport):
+        sys.stdout.write(json.dumps(asdict(LinkVehicle(transport, clock).run(attitudes))))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,35 +72,24 @@ class LinkLatency:
 
 
 class RoundTrips:
-    """Matches answers with sent codes; counts none before ``start``."""
+    """Matches answers with sent codes."""
 
     def __init__(self) -> None:
         self._pending: dict[int, int] = {}
         self._durations = Histogram()
         self._sent = 0
-        self._is_counting = False
         self.answered_in_a_row = 0
 
-    def start(self) -> None:
-        """Start counting."""
-        self._is_counting = True
-        self._pending.clear()
-
     def send(self, code: int, at_ns: int) -> None:
-        """Note a code as sent; drop the oldest pending codes over the limit as lost."""
-        while len(self._pending) >= PENDING_LIMIT:
-            self._pending.pop(next(iter(self._pending)))
-            self.answered_in_a_row = 0
+        """Note a code as sent; a pending one that was sent as the same code is lost."""
+        self.answered_in_a_row = 0 if code in self._pending else self.answered_in_a_row
         self._pending[code] = at_ns
-        self._sent += self._is_counting
+        self._sent += 1
 
     def answer(self, code: int, arrived_ns: int) -> None:
         """Note an answer; only the first one to each code counts."""
-        sent_ns = self._pending.pop(code, None)
-        if sent_ns is None:
-            return
-        self.answered_in_a_row += 1
-        if self._is_counting:
+        if (sent_ns := self._pending.pop(code, None)) is not None:
+            self.answered_in_a_row += 1
             self._durations.add(arrived_ns - sent_ns)
 
     def answers(self) -> LinkLatency:
@@ -157,7 +133,7 @@ class LinkVehicle:
             if self._clock.now_ns() - self._start_ns > CONNECT_S * NS_PER_S:
                 raise TimeoutError(f"no client has answered steadily within {CONNECT_S:g} s")
             due_ns = self._exchange(number, due_ns)
-        self._round_trips.start()
+        self._round_trips = RoundTrips()  # answers from before do not count
         for number in range(attitudes):
             due_ns = self._exchange(number, due_ns)
         return self._round_trips.answers()
@@ -171,7 +147,7 @@ class LinkVehicle:
         self._clock.sleep_until_ns(due_ns)
         ap, code = self._ap, number % CODES
         ap.now_ns = self._clock.now_ns()
-        ap.sensed = ap.sensed._replace(rate_body_radps=(stick_of(code), 0.0, 0.0))
+        ap.sensed = ap.sensed._replace(rate_body_radps=((code - CODE_SPAN) / CODE_SPAN, 0.0, 0.0))
         self._endpoint.send_now(mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
         data = self._endpoint.take_outgoing()
         self._round_trips.send(code, self._clock.now_ns())
@@ -180,7 +156,8 @@ class LinkVehicle:
         for datagram, arrived_ns, _ in self._transport.drain():
             self._server.receive(0, datagram, arrived_ns)
             ap.rc.update(arrived_ns)
-            self._round_trips.answer(code_of_pwm(ap.rc.channels_us[0]), arrived_ns)
+            code = round((ap.rc.channels_us[0] - 1000) / CODE_US)
+            self._round_trips.answer(code, arrived_ns)
         for message_id in ATTITUDES:
             self._endpoint.set_interval(message_id, -1)
         ap.now_ns = self._clock.now_ns()

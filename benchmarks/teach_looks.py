@@ -28,7 +28,7 @@ from mavbridge.commands.output import table_console
 from mavbridge.config.episodes import COURSE_SEEDS, CourseKind
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import CameraImage, Event, VisionTick
+from mavbridge.core.records import Solve
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.flight import SIM_CAMERA_PX, SimulatedFlight
 from mavbridge.simulation.world import make_vehicle
@@ -97,42 +97,18 @@ def fly(seed: int, weights: Path, *, by_rates: bool) -> tuple[Course, list[Viewp
     vehicle = make_vehicle(autopilot="px4" if is_px4 else "ardupilot", conditions=conditions)
     flight = SimulatedFlight(course_seed=COURSE_SEEDS[courses] + seed, seed=seed, vehicle=vehicle)
     bodies: dict[int, BodyState] = {}
-    flight.exposure_watchers.append(lambda seen: bodies.update({seen.frame_id: seen.body}))
-    frames, numbers = _Frames(), count()
-    encoded, solves = dict[bytes, int](), dict[int, tuple[FloatArray, ...]]()
+    moments: dict[int, Viewpoint] = {}
 
+    def keep(solve: Solve) -> None:
+        frame_id = solve.frame_ids[-1][0]
+        moments[frame_id] = Viewpoint(bodies[frame_id], solve.states[0], solve.history[0])
+
+    flight.exposure_watchers.append(lambda seen: bodies.update({seen.frame_id: seen.body}))
+    flight.solve_watchers.append(keep)
     policy = PolicyConfig(policy="toge-rates" if by_rates else "toge", checkpoint=weights)
     with load_configured_policy(policy, MonotonicClock()) as loaded:
-        runner = loaded.runner
-
-        def encode(image: CameraImage, camera: int = 0, /) -> FloatArray:
-            feature = runner.encode(image, camera)
-            encoded[feature.tobytes()] = next(numbers)
-            return feature
-
-        def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-            solves[encoded[feature.tobytes()]] = (state[0].copy(), history[0].copy())
-            return runner.act(feature, state, history)
-
-        logged = replace(runner, encode=encode, act=act)
-        flight.fly(
-            logged, max_time_s=FLIGHT_S, run_out_s=RUN_OUT_S, ends_by_stop=False, sinks=(frames,)
-        )
-    known = {place: bodies[frame] for place, frame in enumerate(frames.ids)}
-    return flight.course, [
-        Viewpoint(known[at], *found) for at, found in solves.items() if at in known
-    ]
-
-
-class _Frames:
-    """Sink: the numbers of the encoded frames, in the order in which they were encoded."""
-
-    def __init__(self) -> None:
-        self.ids: list[int] = []
-
-    def emit(self, event: Event) -> None:
-        if isinstance(event, VisionTick):
-            self.ids.append(event.frame_id)
+        flight.fly(loaded.runner, max_time_s=FLIGHT_S, run_out_s=RUN_OUT_S, ends_by_stop=False)
+    return flight.course, list(moments.values())
 
 
 def draw(seed: int, course: Course, moments: list[Viewpoint], contract: Contract) -> Views:

@@ -17,7 +17,6 @@ import hashlib
 import math
 import subprocess
 import sys
-from collections import Counter
 from dataclasses import asdict, dataclass
 from itertools import product
 from json import dumps, loads
@@ -123,6 +122,7 @@ def main(
     require_outputs(json, plot)
     known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
     cells = {cell.key: cell for cell in known if cell.episodes == episodes}
+    shown = []
     for control, encoder_ms, loop in product(CONTROLS, ENCODER_MS, LOOPS):
         weights = rates if control.is_race else sticks
         key = (control.name, loop, encoder_ms, sha256(weights))
@@ -130,20 +130,10 @@ def main(
             cells[key] = evaluate(control, loop, encoder_ms, weights, episodes, workers)
             json.write_text(dumps([asdict(one) for one in cells.values()], indent=2) + "\n")
             print_cells([cells[key]])
-    shown = shown_cells(list(cells.values()), sticks, rates)
+        shown.append(cells[key])
     print_cells(shown)
     if plot is not None:
         draw(shown, plot)
-
-
-def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
-    """Return all cells of these weights, in the order of controls, encoders and loops."""
-    weights = {control.name: sha256(rates if control.is_race else sticks) for control in CONTROLS}
-    names = list(weights)
-    return sorted(
-        (cell for cell in cells if cell.checkpoint_sha256 == weights.get(cell.control)),
-        key=lambda one: (names.index(one.control), one.encoder_ms, LOOPS.index(one.loop)),
-    )
 
 
 def flags_of(loop: Loop, encoder_ms: int) -> str:
@@ -208,34 +198,26 @@ def print_cells(cells: list[Cell]) -> None:
 
 
 def draw(cells: list[Cell], path: Path) -> None:
-    """Write a PNG of success over encoding time: one panel per control, one line per loop.
-
-    A control flown with a single encoder has no panel.
-    """
+    """Write a PNG of success over encoding time: one panel per control, one line per loop."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    flown = Counter(control for control, _ in {(c.control, c.encoder_ms): None for c in cells})
-    names = [name for name, count in flown.items() if count > 1] or list(flown)
-    encoders_ms = sorted({cell.encoder_ms for cell in cells})
     with style.context(FIGURE_STYLE):
-        rows = math.ceil(len(names) / PANELS_A_ROW)
-        columns = min(len(names), PANELS_A_ROW)
-        size = (6.0 * columns, 4.6 * rows)
+        rows = math.ceil(len(CONTROLS) / PANELS_A_ROW)
+        size = (6.0 * PANELS_A_ROW, 4.6 * rows)
         figure = Figure(figsize=size, dpi=FIGURE_DPI, facecolor="white")
-        panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-        for axes in panels[len(names) :]:
-            axes.set_visible(False)
-        for axes, name in zip(panels, names, strict=False):
+        panels = figure.subplots(rows, PANELS_A_ROW, sharey=True).ravel()
+        for axes, control in zip(panels, CONTROLS, strict=True):
             for loop, colour in zip(LOOPS, (MUTED, BLUE, RED), strict=True):
-                draw_loop(axes, [c for c in cells if (c.control, c.loop) == (name, loop)], colour)
+                of_loop = [c for c in cells if (c.control, c.loop) == (control.name, loop)]
+                draw_loop(axes, of_loop, colour)
             axes.set_xscale("log")
-            axes.set_xticks(encoders_ms, [str(ms) for ms in encoders_ms])
+            axes.set_xticks(ENCODER_MS, [str(ms) for ms in ENCODER_MS])
             axes.minorticks_off()
-            axes.set_xlim(0.85 * encoders_ms[0], 1.18 * encoders_ms[-1])
+            axes.set_xlim(0.85 * ENCODER_MS[0], 1.18 * ENCODER_MS[-1])
             axes.set_ylim(-3, 103)
             axes.set_xlabel("encoder [ms an image]")
-            axes.set_title(name)
+            axes.set_title(control.name)
             axes.legend(loc="lower left")
         panels[0].set_ylabel("courses flown [%], 95 % interval")
         figure.tight_layout(w_pad=3)
@@ -244,8 +226,6 @@ def draw(cells: list[Cell], path: Path) -> None:
 
 def draw_loop(axes: Any, cells: list[Cell], colour: str) -> None:
     """Draw success [%] over encoding time, with its interval."""
-    if not cells:
-        return
     at = [cell.encoder_ms for cell in cells]
     low, high = ([100 * getattr(c, f"success_{end}") for c in cells] for end in ("low", "high"))
     axes.fill_between(at, low, high, color=colour, alpha=0.12, linewidth=0)

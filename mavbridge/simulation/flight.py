@@ -11,7 +11,7 @@ from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import CameraImage, TickSink
+from mavbridge.core.records import CameraImage, Solve, TickSink
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.settings import link_settings
@@ -113,6 +113,8 @@ class SimulatedFlight:
         """Called after each step of the vehicle, every 2.5 ms."""
         self.exposure_watchers: list[Callable[[Exposure], None]] = []
         """Called at each exposure, including frames that are never read."""
+        self.solve_watchers: list[Callable[[Solve], object]] = []
+        """Called with each solve that made a chunk."""
 
     def _random(self, purpose: int) -> np.random.Generator:
         """Return random numbers for one purpose: changing one delay leaves the others alone."""
@@ -198,7 +200,15 @@ class SimulatedFlight:
             ],
             watches_images=self._settings.draw_images,
         )
-        policy = PolicyLoop(plan, runner, clock=policy_clock, view=view, caches=caches, send=send)
+        policy = PolicyLoop(
+            plan,
+            runner,
+            clock=policy_clock,
+            view=view,
+            caches=caches,
+            send=send,
+            watches=self.solve_watchers,
+        )
         for clock, camera, vision in zip(vision_clocks, cameras, visions, strict=True):
             stepper = Stepper(world, clock, camera.has_frame, vision.step)
             camera.arrival_watchers.append(stepper.run)
