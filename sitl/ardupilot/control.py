@@ -14,8 +14,11 @@ from sitl.vehicle.rotation import (
     cos_tilt,
     from_euler,
     integrate,
+    minus,
+    plus,
     rotation_between,
     to_euler,
+    vec3,
     yaw_of,
 )
 
@@ -74,11 +77,8 @@ class AttitudeController:
     def approach(self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""
         error = rotation_between(self._target, ned_from_body_wxyz)
-        rate = [
-            self._shape(axis, error[k], self._target_rate_radps[k], rate_body_radps[k])
-            for k, axis in enumerate("RPY")
-        ]
-        return self._advance(body, (rate[0], rate[1], rate[2]))
+        shaped = map(self._shape, "RPY", error, self._target_rate_radps, rate_body_radps)
+        return self._advance(body, vec3(shaped))
 
     def turn(self, body: BodyState, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards a body rate, without target jumps.
@@ -86,18 +86,16 @@ class AttitudeController:
         As in the firmware, the target does not wait for the vehicle. The vehicle later makes up for
         the angle that it lost at the start, so a weak axis overshoots its rate.
         """
-        rate = [
-            self.slew(axis, rate_body_radps[k], self._target_rate_radps[k])
-            for k, axis in enumerate("RPY")
-        ]
-        return self._advance(body, (rate[0], rate[1], rate[2]))
+        return self._advance(
+            body, vec3(map(self.slew, "RPY", rate_body_radps, self._target_rate_radps))
+        )
 
     def _advance(self, body: BodyState, rate_radps: Vec3) -> Vec3:
         self._set_target(integrate(self._target, rate_radps, STEP_S))
         feedforward = self._response.step(self._target, rate_radps)
         accel = self._track(body, self._response.attitude, self._response.rate_radps)
         self._target_rate_radps = rate_radps
-        return accel[0] + feedforward[0], accel[1] + feedforward[1], accel[2] + feedforward[2]
+        return plus(accel, feedforward)
 
     def _set_target(self, ned_from_body_wxyz: Quat) -> None:
         self._target = ned_from_body_wxyz
@@ -110,13 +108,12 @@ class AttitudeController:
         gains = [self._params[name] for name in _ANGLE_GAINS]
         roll_share, pitch_share = (self._params[name] / DEFAULT_RATE_P for name in _RATE_GAINS)
         shares = (roll_share, pitch_share, 1.0)
-        ax, ay, az = (
+        return vec3(
             shares[k]
             * RATE_GAIN_PER_S[k]
             * (feedforward_radps[k] + gains[k] * error[k] - body.rate_body_radps[k])
             for k in range(3)
         )
-        return (ax, ay, az)
 
     def _shape(
         self, axis: str, error_rad: float, rate_radps: float, wanted_radps: float = 0.0
@@ -160,20 +157,16 @@ class _Response:
 
     def step(self, target: Quat, rate_radps: Vec3) -> Vec3:
         error = rotation_between(self.attitude, target)
-        roll, pitch, yaw = (rate_radps[k] + CATCH_UP_PER_S * error[k] for k in range(3))
+        roll, pitch, yaw = plus(rate_radps, error, CATCH_UP_PER_S)
         before = self._command_radps
         yaw_accel = YAW_GAIN_PER_S * (yaw - before[2])
         self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * STEP_S / YAW_LAG_S
         command = (roll, pitch, before[2] + self._yaw_accel_radps2 * STEP_S)
         self._command_radps = command
-        part = STEP_S / MOTOR_LAG_S
-        roll, pitch, yaw = (
-            r + part * (c - r) for r, c in zip(self.rate_radps, command, strict=True)
-        )
-        self.rate_radps = (roll, pitch, yaw)
+        behind = minus(command, self.rate_radps)
+        self.rate_radps = plus(self.rate_radps, behind, STEP_S / MOTOR_LAG_S)
         self.attitude = integrate(self.attitude, self.rate_radps, STEP_S)
-        roll, pitch, yaw = ((c - b) / STEP_S for c, b in zip(command, before, strict=True))
-        return roll, pitch, yaw
+        return vec3(change / STEP_S for change in minus(command, before))
 
 
 def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:

@@ -16,7 +16,7 @@ from sitl.clock import NS_PER_MS, NS_PER_S, NS_PER_US, next_slot_ns
 from sitl.link.server import Endpoint, Stream
 from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
-from sitl.vehicle.rotation import Vec3
+from sitl.vehicle.rotation import Vec3, plus
 
 _SENSORS = flags(
     "MAV_SYS_STATUS_",
@@ -54,8 +54,7 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
 
     @property
     def gyro_radps(self) -> Vec3:
-        (x, y, z), (bias_x, bias_y, bias_z) = self.ap.sensed.rate_body_radps, GYRO_BIAS_RADPS
-        return (x + bias_x, y + bias_y, z + bias_z)
+        return plus(self.ap.sensed.rate_body_radps, GYRO_BIAS_RADPS)
 
     @property
     def version(self) -> int:

@@ -19,7 +19,7 @@ from sitl.clock import NS_PER_S, Clock, next_slot_ns
 from sitl.course import Course
 from sitl.link.telemetry import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
-from sitl.vehicle.rotation import Quat, Vec3, integrate
+from sitl.vehicle.rotation import Quat, Vec3, integrate, norm, normalised, plus
 
 ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
 
@@ -78,9 +78,7 @@ class PoseListener:
         position_ns, position_m, velocity_mps = self._position
         if now_ns - min(attitude_ns, position_ns) > POSE_MAX_AGE_NS:
             return None
-        dt_s = (now_ns - position_ns) / NS_PER_S
-        (north, east, down), (north_mps, east_mps, down_mps) = position_m, velocity_mps
-        now_m = (north + north_mps * dt_s, east + east_mps * dt_s, down + down_mps * dt_s)
+        now_m = plus(position_m, velocity_mps, (now_ns - position_ns) / NS_PER_S)
         return now_m, integrate(wxyz, rate_radps, (now_ns - attitude_ns) / NS_PER_S)
 
     def outgoing(self, now_ns: int) -> list[bytes]:
@@ -105,10 +103,8 @@ class PoseListener:
             case "ATTITUDE_QUATERNION":
                 rate_radps = (message.rollspeed, message.pitchspeed, message.yawspeed)
                 wxyz = (message.q1, message.q2, message.q3, message.q4)
-                norm = math.hypot(*wxyz)
-                if 0.9 < norm < 1.1 and all(map(math.isfinite, rate_radps)):
-                    w, x, y, z = (part / norm for part in wxyz)
-                    self._attitude = (arrived_ns, (w, x, y, z), rate_radps)
+                if 0.9 < norm(wxyz) < 1.1 and all(map(math.isfinite, rate_radps)):
+                    self._attitude = (arrived_ns, normalised(wxyz), rate_radps)
             case "LOCAL_POSITION_NED":
                 position_m = (message.x, message.y, message.z)
                 velocity_mps = (message.vx, message.vy, message.vz)

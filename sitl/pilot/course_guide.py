@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sitl import UsageError
 from sitl.course import Course, Gate, GateCounter, crossing
 from sitl.vehicle.dynamics import clamp
-from sitl.vehicle.rotation import Vec3, horizontal, length, wrap_pi
+from sitl.vehicle.rotation import Vec3, horizontal, length, plus, wrap_pi
 
 FloatArray = NDArray[np.float64]
 
@@ -95,13 +95,12 @@ class CourseGuide:
         self._course = course
         self._last = course.gates[-1]
         # Points straight ahead of the last gate, so that it is flown like any other.
-        north_m, east_m, down_m = self._last.center_ned_m
         step_m = cmath.rect(BEYOND_LEG_M, self._last.yaw_rad)
-        beyond_ned_m = [
-            (north_m + k * step_m.real, east_m + k * step_m.imag, down_m)
+        leg_ned_m = (step_m.real, step_m.imag, 0.0)
+        self._beyond = tuple(
+            replace(self._last, center_ned_m=plus(self._last.center_ned_m, leg_ned_m, k))
             for k in range(1, GATES_AHEAD + 1)
-        ]
-        self._beyond = tuple(replace(self._last, center_ned_m=point) for point in beyond_ned_m)
+        )
         self._agility = agility
         self._speed_mps = speed_mps
         self._referee = GateCounter(course, first=next_gate)

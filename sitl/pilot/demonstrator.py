@@ -7,7 +7,7 @@ from typing import NamedTuple
 from sitl.pilot.course_guide import Agility, CourseGuide, Demand, Predicted
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
-from sitl.vehicle.rotation import Quat, Vec3, conjugate, integrate, rotate, wrap_pi, yaw_of
+from sitl.vehicle.rotation import Quat, Vec3, conjugate, integrate, plus, rotate, wrap_pi, yaw_of
 
 HOVER_THRUST = 0.39
 TILT_GAIN_PER_S = 8.0
@@ -174,22 +174,16 @@ def _drag_ned_mps2(body: BodyState) -> Vec3:
 
 def _level_accel_mps2(body: BodyState, drag_ned_mps2: Vec3) -> Vec3:
     """Return the acceleration of the present lean in level flight."""
-    thrust_n, thrust_e, thrust_d = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
-    per_g = GRAVITY_MPS2 / max(0.5, -thrust_d)
-    return thrust_n * per_g + drag_ned_mps2[0], thrust_e * per_g + drag_ned_mps2[1], 0.0
+    thrust_ned = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
+    north, east, _ = plus(drag_ned_mps2, thrust_ned, GRAVITY_MPS2 / max(0.5, -thrust_ned[2]))
+    return north, east, 0.0
 
 
 def _predict(body: BodyState, accel_mps2: Vec3, lag_s: float) -> Predicted:
     """Extrapolate by the lag at this acceleration."""
-    half = lag_s * lag_s / 2
-    north, east, down = (
-        (place + speed * lag_s + accel * half, speed + accel * lag_s)
-        for place, speed, accel in zip(
-            body.position_ned_m, body.velocity_ned_mps, accel_mps2, strict=True
-        )
-    )
+    moved_m = plus(body.position_ned_m, body.velocity_ned_mps, lag_s)
     return Predicted(
-        position_ned_m=(north[0], east[0], down[0]),
-        velocity_ned_mps=(north[1], east[1], down[1]),
+        position_ned_m=plus(moved_m, accel_mps2, lag_s * lag_s / 2),
+        velocity_ned_mps=plus(body.velocity_ned_mps, accel_mps2, lag_s),
         yaw_rad=wrap_pi(yaw_of(body.ned_from_body_wxyz) + body.rate_body_radps[2] * lag_s),
     )

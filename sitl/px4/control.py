@@ -19,9 +19,12 @@ from sitl.vehicle.rotation import (
     from_euler,
     horizontal,
     length,
+    minus,
     multiply,
+    plus,
     rotate,
     rotation_between,
+    vec3,
 )
 
 STEP_NS = 4 * NS_PER_MS
@@ -73,29 +76,22 @@ class RateController:
         error = rotation_between(body.ned_from_body_wxyz, target)
         gains = [self._params[f"MC_{axis}_P"] for axis in ("ROLL", "PITCH", "YAW")]
         down_body = rotate(conjugate(body.ned_from_body_wxyz), (0.0, 0.0, 1.0))
-        roll, pitch, yaw = (
-            gain * angle + yaw_rate_radps * down
-            for gain, angle, down in zip(gains, error, down_body, strict=True)
-        )
-        return self.rates(body, (roll, pitch, yaw))
+        wanted = vec3(gain * angle for gain, angle in zip(gains, error, strict=True))
+        return self.rates(body, plus(wanted, down_body, yaw_rate_radps))
 
     def rates(self, body: BodyState, wanted_radps: Vec3) -> Vec3:
         """Return the angular acceleration towards body rates, each limited to its MC_*RATE_MAX."""
-        limits = [self._params[f"MC_{axis}RATE_MAX"] for axis in ("ROLL", "PITCH", "YAW")]
-        roll, pitch, yaw = (
-            clamp(rate, math.radians(limit))
-            for rate, limit in zip(wanted_radps, limits, strict=True)
-        )
-        self.rates_radps = (roll, pitch, yaw)
+        limits = (self._params[f"MC_{axis}RATE_MAX"] for axis in ("ROLL", "PITCH", "YAW"))
+        self.rates_radps = vec3(map(clamp, wanted_radps, map(math.radians, limits)))
         roll_share, pitch_share = (
             self._params[name] / DEFAULT_RATE_P for name in ("MC_ROLLRATE_P", "MC_PITCHRATE_P")
         )
-        actual = body.rate_body_radps
-        yaw_accel = YAW_GAIN_PER_S * (yaw - actual[2])
+        roll, pitch, yaw = minus(self.rates_radps, body.rate_body_radps)
+        yaw_accel = YAW_GAIN_PER_S * yaw
         self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * STEP_S / YAW_TORQUE_LAG_S
         return (
-            roll_share * RATE_GAIN_PER_S * (roll - actual[0]),
-            pitch_share * RATE_GAIN_PER_S * (pitch - actual[1]),
+            roll_share * RATE_GAIN_PER_S * roll,
+            pitch_share * RATE_GAIN_PER_S * pitch,
             self._yaw_accel_radps2,
         )
 

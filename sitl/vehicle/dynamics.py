@@ -15,11 +15,14 @@ import mujoco
 import numpy as np
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
-from sitl.vehicle.rotation import Quat, Vec3, cos_tilt, length
+from sitl.vehicle.rotation import Quat, Vec3, cos_tilt, length, vec3
 
 GRAVITY_MPS2 = 9.80665
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
 MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
+MOTORS = ((1, -1), (-1, 1), (1, 1), (-1, -1))
+"""Forward and left of each motor, in the order of ArduCopter's quad X. The first two turn
+anticlockwise seen from above, so they push the nose to the right."""
 YAW_TORQUE_PER_THRUST_M = 0.016
 REST_HEIGHT_M = 0.06
 VERTICAL_GUST_SHARE = 0.5
@@ -48,15 +51,16 @@ _BODY = 1  # after the world
 
 
 def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
-    """Return the XML of the MuJoCo model; compiling it derives hidden values from the masses.
-
-    Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
-    seen from above, so they push the nose to the right.
-    """
+    """Return the XML of the MuJoCo model; compiling it derives hidden values from the masses."""
     density = airframe.air_density_kgpm3 * conditions.drag_factor
     thrust_n = airframe.max_motor_thrust_n * conditions.thrust_factor
     motor_lag_s = airframe.motor_lag_s * conditions.motor_lag_factor
     inertia_kgm2 = [conditions.mass_factor * moment for moment in INERTIA_KGM2]
+    sites, rotors = "", ""
+    for forward, left in MOTORS:
+        name, torque_m = f"{forward} {left}", forward * left * YAW_TORQUE_PER_THRUST_M
+        sites += f'<site name="{name}" pos="{forward * MOTOR_ARM_M} {left * MOTOR_ARM_M} 0"/>'
+        rotors += f'<general site="{name}" gear="0 0 1 0 0 {torque_m}"/>'
     return f"""
 <mujoco>
   <option timestep="{airframe.step_ns / 1e9}" gravity="0 0 -{GRAVITY_MPS2}" density="{density}"
@@ -77,18 +81,10 @@ def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
       <geom type="sphere" size="0.02" pos="-0.12 -0.12 -0.04"/>
       <geom type="box" size="0.14 0.14 0.03" pos="0 0 0.01"/>
       <site name="imu"/>
-      <site name="front_right" pos="{MOTOR_ARM_M} {-MOTOR_ARM_M} 0"/>
-      <site name="rear_left" pos="{-MOTOR_ARM_M} {MOTOR_ARM_M} 0"/>
-      <site name="front_left" pos="{MOTOR_ARM_M} {MOTOR_ARM_M} 0"/>
-      <site name="rear_right" pos="{-MOTOR_ARM_M} {-MOTOR_ARM_M} 0"/>
+      {sites}
     </body>
   </worldbody>
-  <actuator>
-    <general site="front_right" gear="0 0 1 0 0 -{YAW_TORQUE_PER_THRUST_M}"/>
-    <general site="rear_left" gear="0 0 1 0 0 -{YAW_TORQUE_PER_THRUST_M}"/>
-    <general site="front_left" gear="0 0 1 0 0 {YAW_TORQUE_PER_THRUST_M}"/>
-    <general site="rear_right" gear="0 0 1 0 0 {YAW_TORQUE_PER_THRUST_M}"/>
-  </actuator>
+  <actuator>{rotors}</actuator>
   <sensor><accelerometer site="imu"/></sensor>
 </mujoco>
 """
@@ -192,8 +188,7 @@ class Wind:
             return (0.0, 0.0, 0.0)
         noise = self._innovation * self._rms * self._random.standard_normal(3)
         self._gust = self._decay * self._gust + noise
-        north, east, down = (self._mean + self._gust).tolist()
-        return (north, east, down)
+        return vec3((self._mean + self._gust).tolist())
 
 
 class SensorNoise:
@@ -201,14 +196,8 @@ class SensorNoise:
 
     def __init__(self, conditions: Conditions) -> None:
         self._random = np.random.Generator(np.random.PCG64((conditions.seed, 2)))
-        self._sigma = np.repeat(
-            [
-                conditions.velocity_noise_mps,
-                conditions.rate_noise_radps,
-                conditions.specific_force_noise_mps2,
-            ],
-            3,
-        )
+        velocity_mps, rate_radps = conditions.velocity_noise_mps, conditions.rate_noise_radps
+        self._sigma = np.repeat((velocity_mps, rate_radps, conditions.specific_force_noise_mps2), 3)
         self._is_exact = not self._sigma.any()
 
     def sense(self, truth: BodyState) -> BodyState:
@@ -216,11 +205,9 @@ class SensorNoise:
             return truth
         exact = (truth.velocity_ned_mps, truth.rate_body_radps, truth.specific_force_body_mps2)
         noise = self._sigma * self._random.standard_normal(9)
-        sensed = (np.ravel(exact) + noise).tolist()
+        velocity, rate, force = map(vec3, (np.ravel(exact) + noise).reshape(3, 3).tolist())
         return truth._replace(
-            velocity_ned_mps=tuple(sensed[0:3]),
-            rate_body_radps=tuple(sensed[3:6]),
-            specific_force_body_mps2=tuple(sensed[6:9]),
+            velocity_ned_mps=velocity, rate_body_radps=rate, specific_force_body_mps2=force
         )
 
 
@@ -282,11 +269,6 @@ def thrust_for(accel_up_mps2: float, cos_tilt: float, hover: float) -> float:
     return max(0.0, min(1.0, hover * (1.0 + accel_up_mps2 / GRAVITY_MPS2) / max(cos_tilt, 0.5)))
 
 
-_ROLL_SIGN = (-1.0, 1.0, 1.0, -1.0)
-_PITCH_SIGN = (1.0, -1.0, 1.0, -1.0)
-_YAW_SIGN = (1.0, 1.0, -1.0, -1.0)
-
-
 def mix(
     collective: float, angular_accel_radps2: Vec3, airframe: Airframe = QUAD
 ) -> tuple[float, ...]:
@@ -298,9 +280,6 @@ def mix(
     pitch = clamp(ay * iy / per_arm, 0.25)
     yaw_room = max(0.05, 0.45 - abs(roll) - abs(pitch))
     yaw = clamp(az * iz / (4.0 * YAW_TORQUE_PER_THRUST_M * airframe.max_motor_thrust_n), yaw_room)
-    turns = tuple(
-        r * roll + p * pitch + y * yaw
-        for r, p, y in zip(_ROLL_SIGN, _PITCH_SIGN, _YAW_SIGN, strict=True)
-    )
+    turns = [left * roll + forward * pitch - forward * left * yaw for forward, left in MOTORS]
     collective = max(SPIN_MIN - min(turns), min(1.0 - max(turns), collective))
     return tuple(max(SPIN_MIN, min(1.0, collective + turn)) for turn in turns)

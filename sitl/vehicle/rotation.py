@@ -5,6 +5,7 @@ body (FRD) vectors into NED. Euler angles are yaw, then pitch, then roll (aerosp
 """
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 Vec3: TypeAlias = tuple[float, float, float]
@@ -13,8 +14,29 @@ Quat: TypeAlias = tuple[float, float, float, float]
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
+def vec3(values: Iterable[float]) -> Vec3:
+    x, y, z = values
+    return (x, y, z)
+
+
 def minus(a: Vec3, b: Vec3) -> Vec3:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def plus(a: Vec3, b: Vec3, factor: float = 1.0) -> Vec3:
+    """Return a + factor * b."""
+    return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2])
+
+
+def norm(q: Sequence[float]) -> float:
+    w, x, y, z = q
+    return math.sqrt(w * w + x * x + y * y + z * z)
+
+
+def normalised(q: Sequence[float]) -> Quat:
+    """Return the quaternion of unit length."""
+    size = norm(q)
+    return (q[0] / size, q[1] / size, q[2] / size, q[3] / size)
 
 
 def multiply(a: Quat, b: Quat) -> Quat:
@@ -89,9 +111,7 @@ def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt_s
     scale = 0.5 * dt_s if half < 1e-9 else math.sin(half) / rate
-    w, x, y, z = multiply(q, (math.cos(half), wx * scale, wy * scale, wz * scale))
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    return (w / norm, x / norm, y / norm, z / norm)
+    return normalised(multiply(q, (math.cos(half), wx * scale, wy * scale, wz * scale)))
 
 
 def cos_tilt(q: Quat) -> float:
