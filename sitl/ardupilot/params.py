@@ -85,7 +85,7 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 
 
 class ArduPilotParams(Params):
-    """ArduPilot's parameters; `on_wire` and `set_on_wire` use the names of the release."""
+    """ArduPilot's parameters, on the wire by the names of the release."""
 
     def __init__(self, config: VehicleConfig = DEFAULT_VEHICLE) -> None:
         values = _FIXED | _varied(config.conditions)
@@ -94,21 +94,10 @@ class ArduPilotParams(Params):
             dead_zone_us = dead_zones_us[index] if index < len(dead_zones_us) else 0.0
             channel = {**_RC_CHANNEL, "DZ": dead_zone_us}
             values |= {f"RC{index + 1}_{name}": value for name, value in channel.items()}
-        renamed = _NAMES_4_6 if config.ardupilot_release == "4.6" else {}
-        if renamed:
+        is_old = config.ardupilot_release == "4.6"
+        if is_old:
             del values["MAV_GCS_SYSID_HI"]
-        super().__init__(values)
-        named = {renamed.get(name, name): name for name in self._values}
-        self._by_wire_name = {name: named[name] for name in sorted(named)}
-        self.names = tuple(self._by_wire_name)
-
-    def on_wire(self, name: str) -> float:
-        """Return the value of this name, one of ``names``."""
-        return self._values[self._by_wire_name[name]]
-
-    def set_on_wire(self, name: str, packed: float) -> bool:
-        """Store a value by its wire name. Return False if refused, like `set`."""
-        return name in self._by_wire_name and self.set(self._by_wire_name[name], packed)
+        super().__init__(values, renamed=_NAMES_4_6 if is_old else {})
 
     def decimal(self, name: str) -> float:
         """Return the value rounded to the seven digits of a float32: 0.15, not 0.1500000059."""

@@ -20,16 +20,16 @@ from sitl.link.server import (
     DENIED,
     FAILED,
     FORCE,
-    MAX_RC_FIELDS,
     UNSUPPORTED,
     MavlinkServer,
     Params7,
+    rc_values_us,
     send_ack,
 )
 from sitl.link.telemetry import Message
 from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
-from sitl.vehicle.rotation import from_euler, rotate
+from sitl.vehicle.rotation import from_euler, norm, normalised, rotate
 
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)
 _OPTION_GCS_ONLY = 1
@@ -78,52 +78,43 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         high = max(low, int(self._ap.params.get("MAV_GCS_SYSID_HI", 0.0)))
         return low <= int(message.get_srcSystem()) <= high
 
-    def on_heartbeat(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_heartbeat(self, _link: ArduPilotEndpoint, message: Message) -> None:
         if self._is_from_gcs(message):
-            self._ap.gcs_failsafe.on_contact(arrived_ns)
+            self._ap.gcs_failsafe.on_contact(self._arrived_ns)
 
-    def on_rc_channels_override(
-        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
-    ) -> None:
+    def on_rc_channels_override(self, _link: ArduPilotEndpoint, message: Message) -> None:
         if not self._is_from_gcs(message):
             return
-        self._ap.gcs_failsafe.on_contact(arrived_ns)
-        raw_us = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
+        self._ap.gcs_failsafe.on_contact(self._arrived_ns)
+        raw_us = rc_values_us(message)
         primary = set(raw_us[:PRIMARY_CHANNELS])
         if primary - {RELEASE, IGNORE}:
-            self._log.overrides.add(arrived_ns)
+            self._log.overrides.add(self._arrived_ns)
         elif RELEASE in primary:
             self._log.releases += 1
-        self._ap.rc.override(raw_us, arrived_ns)
+        self._ap.rc.override(raw_us, self._arrived_ns)
 
-    def on_manual_control(
-        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
-    ) -> None:
-        is_for_us = message.target == self._ap.system_id
-        if not is_for_us or not self._is_from_gcs(message):
+    def on_manual_control(self, _link: ArduPilotEndpoint, message: Message) -> None:
+        if message.target != self._ap.system_id or not self._is_from_gcs(message):
             return
-        self._ap.gcs_failsafe.on_contact(arrived_ns)
-        self._log.manual_controls.add(arrived_ns)
+        self._ap.gcs_failsafe.on_contact(self._arrived_ns)
+        self._log.manual_controls.add(self._arrived_ns)
         self._ap.rc.manual_control(
-            x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
+            x=message.x, y=message.y, z=message.z, r=message.r, now_ns=self._arrived_ns
         )
 
-    def on_set_attitude_target(
-        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
-    ) -> None:
+    def on_set_attitude_target(self, _link: ArduPilotEndpoint, message: Message) -> None:
         ap = self._ap
         if ap.guided is None:
             return
         setpoint = _attitude_setpoint(message)
         if setpoint is not None:
-            ap.guided.follow_attitude(setpoint, ap.sensed, arrived_ns)
-            self._log.setpoints.add(arrived_ns)
+            ap.guided.follow_attitude(setpoint, ap.sensed, self._arrived_ns)
+            self._log.setpoints.add(self._arrived_ns)
         elif ap.mode is Mode.GUIDED:
             ap.guided.brake(ap.sensed)
 
-    def on_set_position_target_local_ned(
-        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
-    ) -> None:
+    def on_set_position_target_local_ned(self, _link: ArduPilotEndpoint, message: Message) -> None:
         """Follow a velocity in GUIDED; GUIDED_NOGPS ignores it."""
         ap = self._ap
         if ap.guided is None or ap.mode is not Mode.GUIDED:
@@ -132,17 +123,14 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if setpoint is None:
             ap.guided.brake(ap.sensed)
         else:
-            ap.guided.follow_velocity(setpoint, ap.sensed, arrived_ns)
-            self._log.setpoints.add(arrived_ns)
+            ap.guided.follow_velocity(setpoint, ap.sensed, self._arrived_ns)
+            self._log.setpoints.add(self._arrived_ns)
 
-    def on_set_mode(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
-        has_mode = message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        result = self._to_mode(message.custom_mode) if has_mode else DENIED
+    def on_set_mode(self, link: ArduPilotEndpoint, message: Message) -> None:
+        result = self.cmd_do_set_mode((message.base_mode, message.custom_mode), link)
         send_ack(link, message, mav.MAVLINK_MSG_ID_SET_MODE, result)
 
-    def on_request_data_stream(
-        self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int
-    ) -> None:
+    def on_request_data_stream(self, link: ArduPilotEndpoint, message: Message) -> None:
         rate_hz = message.req_message_rate if message.start_stop else 0
         link.set_group(message.req_stream_id, rate_hz)
 
@@ -160,11 +148,10 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         return self._to_mode(Mode.LAND)
 
     def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
-        if not _are_finite(params[:2]):
-            return DENIED
-        if not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            return DENIED
-        return self._to_mode(params[1])
+        is_finite = all(map(math.isfinite, params[:2]))
+        if is_finite and int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return self._to_mode(params[1])
+        return DENIED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if params[0] not in (0.0, 1.0):
@@ -191,25 +178,17 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         return ACCEPTED
 
 
-def _are_finite(params: Params7) -> bool:
-    return all(map(math.isfinite, params))
-
-
 def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:
     mask = message.type_mask
     ignored_rates = mask & _RATES_IGNORED
-    if mask & mav.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
-        return None
-    if ignored_rates not in (0, _RATES_IGNORED):
+    has_thrust = not mask & mav.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE
+    if not has_thrust or ignored_rates not in (0, _RATES_IGNORED):
         return None
     attitude = None
     if not mask & mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
-        w, x, y, z = message.q
-        norm = w * w + x * x + y * y + z * z
-        if not abs(norm - 1.0) <= MAX_NORM_ERROR:  # negated, so that NaN is refused
+        if not abs(norm(message.q) ** 2 - 1.0) <= MAX_NORM_ERROR:  # negated, to refuse NaN
             return None
-        length = math.sqrt(norm)
-        attitude = (w / length, x / length, y / length, z / length)
+        attitude = normalised(message.q)
     rate = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
     return AttitudeSetpoint(attitude, (0.0, 0.0, 0.0) if ignored_rates else rate, message.thrust)
 

@@ -128,11 +128,10 @@ class Endpoint(ABC, Generic[Ap]):
 
     def send_param(self, index: int) -> None:
         """Send PARAM_VALUE; ``index`` must exist."""
-        params = self._ap.params
-        name = params.names[index]
-        value = (params.on_wire(name), params.kind(name))
-        count = len(params.names)
-        self.send(mav.MAVLink_param_value_message(name.encode(), *value, count, index))
+        names = self._ap.params.names
+        value = self._ap.params.on_wire(names[index])
+        name = names[index].encode()
+        self.send(mav.MAVLink_param_value_message(name, *value, len(names), index))
 
 
 ACCEPTED: int = mav.MAV_RESULT_ACCEPTED
@@ -142,7 +141,6 @@ UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrides a refusal (MAVLink common.xml)
 UINT16_MAX = 65535
-MAX_RC_FIELDS = 18
 COMMAND_FIELDS = {
     "COMMAND_LONG": tuple(f"param{n}" for n in range(1, 8)),
     "COMMAND_INT": ("param1", "param2", "param3", "param4", "x", "y", "z"),
@@ -156,9 +154,8 @@ Params7: TypeAlias = tuple[float, ...]
 class MavlinkServer(ABC, Generic[Ap, Link]):
     """Receives on all links of one vehicle, and acts on the messages.
 
-    ``on_NAME`` handles a message, given the link, the message and its arrival. ``cmd_NAME`` handles
-    a command, given its parameters and the link; it returns the MAV_RESULT of the ack, or None for
-    no ack.
+    ``on_NAME`` handles a message, given the link and the message. ``cmd_NAME`` handles a command,
+    given its parameters and the link; it returns the MAV_RESULT of the ack, or None for no ack.
     """
 
     bad_interval: ClassVar[int]
@@ -173,6 +170,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         self.reboot_requested = False  # a command has requested a reboot
         self._ap = ap
         self._log = log
+        self._arrived_ns = 0  # arrival of the message that is being handled
 
     def receive(self, link_id: int, data: bytes, arrived_ns: int) -> None:
         """Act on the bytes of one datagram, or of one read of a stream."""
@@ -181,7 +179,8 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
             self._pass_on(link, message)
             handler = getattr(self, f"on_{message.get_type().lower()}", None)
             if handler is not None and self._is_accepted(message):
-                handler(link, message, arrived_ns)
+                self._arrived_ns = arrived_ns
+                handler(link, message)
 
     def step(self, now_ns: int) -> None:
         """Queue due messages and the vehicle's texts on every link. ``now_ns`` is at most one
@@ -213,7 +212,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         handler: Callable[[Params7, Link], int | None] | None = getattr(self, name, None)
         return UNSUPPORTED if handler is None else handler(params, link)
 
-    def on_command_long(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_command_long(self, link: Link, message: Message) -> None:
         fields = COMMAND_FIELDS[message.get_type()]
         params = tuple(float(getattr(message, name)) for name in fields)
         result = self._execute(message, params, link)
@@ -240,25 +239,30 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
             return DENIED
         return ACCEPTED if link.send_now(int(params[0])) else self.unknown_message
 
-    def on_param_request_list(self, link: Link, _message: Message, _arrived_ns: int) -> None:
+    def on_param_request_list(self, link: Link, _message: Message) -> None:
         link.send_all_params()
 
-    def on_param_request_read(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_param_request_read(self, link: Link, message: Message) -> None:
         index, names = message.param_index, self._ap.params.names
         if index < 0 and message.param_id in names:
             index = names.index(message.param_id)
         if 0 <= index < len(names):
             link.send_param(index)
 
-    def on_param_set(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_param_set(self, link: Link, message: Message) -> None:
         if self._ap.params.set_on_wire(message.param_id, message.param_value):
             link.send_param(self._ap.params.names.index(message.param_id))
 
-    def on_timesync(self, link: Link, message: Message, arrived_ns: int) -> None:
+    def on_timesync(self, link: Link, message: Message) -> None:
         """Answer a request; answers (tc1 set) to our requests need no action."""
         if message.tc1 == 0:
-            uptime_us = (arrived_ns - self._ap.boot_ns) // 1000
+            uptime_us = (self._arrived_ns - self._ap.boot_ns) // 1000
             link.send(mav.MAVLink_timesync_message(uptime_us * 1000, message.ts1))
+
+
+def rc_values_us(message: Message) -> list[int]:
+    """Return the 18 channels of an RC_CHANNELS_OVERRIDE."""
+    return [getattr(message, f"chan{n}_raw") for n in range(1, 19)]
 
 
 def sender_of(message: Message) -> tuple[int, int]:

@@ -6,6 +6,8 @@ PX4 stores INT32 and float.
 from collections.abc import Mapping
 from types import MappingProxyType
 
+import numpy as np
+
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import DEFAULT_VEHICLE, Px4Release, VehicleConfig
 from sitl.vehicle.firmware import Params, float32
@@ -62,35 +64,28 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
     | {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_V_AUTO_DN": 1.5, "MPC_Z_V_AUTO_UP": 3.0}
     | {"RTL_MIN_DIST": 10.0, "RTL_RETURN_ALT": 30.0}
 )
-_OLD_NAMES: Mapping[str, float] = MappingProxyType(
-    {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
-)
+_OLD_NAMES: Mapping[str, float] = {
+    "MPC_HOLD_DZ": 0.1,
+    "MPC_YAW_EXPO": 0.6,
+    "MPC_Z_MAN_EXPO": 0.6,
+}
 """Parameters of releases before 1.17 in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
 _OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
-_ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
-    {
-        "1.14": (*_NEW_OVERRIDE, DEAD_ZONE),
-        "1.17": _NEW_OVERRIDE,
-        "1.18": _OLD_OVERRIDE,
-    }
-)
+_ABSENT: Mapping[Px4Release, tuple[str, ...]] = {
+    "1.14": (*_NEW_OVERRIDE, DEAD_ZONE),
+    "1.17": _NEW_OVERRIDE,
+    "1.18": _OLD_OVERRIDE,
+}
 DEFAULT_RATE_P = float32(_FLOATS["MC_ROLLRATE_P"])
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
     """Return the varying settings: PX4's defaults, scaled by the same factors as ArduPilot's."""
-    lean = conditions.angle_max_cdeg / NOMINAL.angle_max_cdeg
-    yaw_rate = conditions.pilot_yaw_rate_degps / NOMINAL.pilot_yaw_rate_degps
-    climb = conditions.pilot_speed_up_cmps / NOMINAL.pilot_speed_up_cmps
     down_cmps = conditions.pilot_speed_down_cmps or conditions.pilot_speed_up_cmps
-    descent = down_cmps / NOMINAL.pilot_speed_up_cmps
+    roll_gain, pitch_gain, yaw_gain = np.divide(
+        conditions.angle_gains_per_s, NOMINAL.angle_gains_per_s
+    ).tolist()
     climb_accel = conditions.pilot_accel_z_cmps2 / NOMINAL.pilot_accel_z_cmps2
-    roll_gain, pitch_gain, yaw_gain = (
-        gain / nominal
-        for gain, nominal in zip(
-            conditions.angle_gains_per_s, NOMINAL.angle_gains_per_s, strict=True
-        )
-    )
     factors = {
         "MC_PITCHRATE_P": conditions.rate_gain_factor,
         "MC_PITCH_P": pitch_gain,
@@ -99,11 +94,11 @@ def _varied(conditions: Conditions) -> dict[str, float]:
         "MC_YAW_P": yaw_gain,
         "MPC_ACC_DOWN_MAX": climb_accel,
         "MPC_ACC_UP_MAX": climb_accel,
-        "MPC_MAN_TILT_MAX": lean,
-        "MPC_MAN_Y_MAX": yaw_rate,
+        "MPC_MAN_TILT_MAX": conditions.angle_max_cdeg / NOMINAL.angle_max_cdeg,
+        "MPC_MAN_Y_MAX": conditions.pilot_yaw_rate_degps / NOMINAL.pilot_yaw_rate_degps,
         "MPC_MAN_Y_TAU": conditions.input_time_s / NOMINAL.input_time_s,
-        "MPC_Z_VEL_MAX_DN": descent,
-        "MPC_Z_VEL_MAX_UP": climb,
+        "MPC_Z_VEL_MAX_DN": down_cmps / NOMINAL.pilot_speed_up_cmps,
+        "MPC_Z_VEL_MAX_UP": conditions.pilot_speed_up_cmps / NOMINAL.pilot_speed_up_cmps,
     }
     return {name: factor * _FLOATS[name] for name, factor in factors.items()}
 

@@ -14,10 +14,10 @@ from sitl.link.server import (
     DENIED,
     FAILED,
     FORCE,
-    MAX_RC_FIELDS,
     REJECTED,
     MavlinkServer,
     Params7,
+    rc_values_us,
     send_ack,
 )
 from sitl.link.telemetry import Message
@@ -28,7 +28,7 @@ from sitl.px4.modes import Px4Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
-from sitl.vehicle.rotation import Vec3, horizontal
+from sitl.vehicle.rotation import Vec3, horizontal, norm, normalised
 
 _RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
@@ -76,42 +76,36 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             if other is not link:
                 other.pass_on(bytes(message.get_msgbuf()))
 
-    def on_heartbeat(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+    def on_heartbeat(self, link: Px4Endpoint, message: Message) -> None:
         if message.type == mav.MAV_TYPE_GCS:
             link.has_gcs = True
 
-    def on_manual_control(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
-        self._log.manual_controls.add(arrived_ns)
+    def on_manual_control(self, link: Px4Endpoint, message: Message) -> None:
+        self._log.manual_controls.add(self._arrived_ns)
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
-        self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
+        self._ap.stick_input.on_sticks(self.links.index(link), sticks, self._arrived_ns)
 
-    def on_rc_channels_override(
-        self, _link: Px4Endpoint, message: Message, arrived_ns: int
-    ) -> None:
+    def on_rc_channels_override(self, _link: Px4Endpoint, message: Message) -> None:
         """Treat the values as those of a receiver; PX4 has no override."""
-        self._log.overrides.add(arrived_ns)
-        values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
-        self._ap.receiver.move([0 if value == _RC_IGNORE else value for value in values])
+        self._log.overrides.add(self._arrived_ns)
+        values_us = rc_values_us(message)
+        self._ap.receiver.move([0 if value == _RC_IGNORE else value for value in values_us])
 
-    def on_set_attitude_target(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+    def on_set_attitude_target(self, _link: Px4Endpoint, message: Message) -> None:
         mask = message.type_mask
         rates: Vec3 = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
         if not mask & _IGNORE_ATTITUDE:
             yaw_rate = 0.0 if mask & _IGNORE_YAW_RATE else message.body_yaw_rate
-            w, x, y, z = message.q
-            length = math.sqrt(w * w + x * x + y * y + z * z)
-            if not (math.isfinite(length) and length > 0.5 and math.isfinite(yaw_rate)):
+            if not (0.5 < norm(message.q) < math.inf and math.isfinite(yaw_rate)):
                 self._log.refused_messages += 1
                 return
-            attitude = (w / length, x / length, y / length, z / length)
-            setpoint = AttitudeSetpoint(attitude, (0.0, 0.0, yaw_rate), _thrust(message))
-            self._follow(setpoint, arrived_ns)
+            turn = (0.0, 0.0, yaw_rate)
+            setpoint = AttitudeSetpoint(normalised(message.q), turn, _thrust(message))
+            self._follow(setpoint)
         elif not mask & _IGNORE_RATES and all(map(math.isfinite, rates)):
-            self._follow(AttitudeSetpoint(None, rates, _thrust(message)), arrived_ns)
+            self._follow(AttitudeSetpoint(None, rates, _thrust(message)))
 
-    def on_set_position_target_local_ned(
-        self, link: Px4Endpoint, message: Message, arrived_ns: int
-    ) -> None:
+    def on_set_position_target_local_ned(self, link: Px4Endpoint, message: Message) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
         if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
             self._ap.refuse_frame(frame)
@@ -126,14 +120,14 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if not all(map(math.isfinite, (*velocity, yaw_rate))):
             self._log.refused_messages += 1
             return
-        self._follow(VelocitySetpoint(velocity, yaw_rate), arrived_ns)
+        self._follow(VelocitySetpoint(velocity, yaw_rate))
 
-    def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
-        self._ap.set_setpoint(setpoint, arrived_ns)
+    def _follow(self, setpoint: Setpoint) -> None:
+        self._ap.set_setpoint(setpoint, self._arrived_ns)
         if self._ap.mode_name == "OFFBOARD":
-            self._log.setpoints.add(arrived_ns)
+            self._log.setpoints.add(self._arrived_ns)
 
-    def on_set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+    def on_set_mode(self, link: Px4Endpoint, message: Message) -> None:
         """Change the mode by SET_MODE, acknowledged as DO_SET_MODE, which replaced it."""
         main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
         result = self._change_mode(message, message.base_mode, main, sub)

@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from itertools import zip_longest
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -24,7 +25,6 @@ STOPPED = (0.0, 0.0, 0.0, 0.0)
 LANDED_AFTER_NS = NS_PER_S
 LANDED_SPEED_MPS = 0.3
 RECEIVER_PERIOD_NS = NS_PER_S // 50
-_INT32_LIMIT = 1 << 31
 
 
 class Severity(IntEnum):
@@ -110,17 +110,27 @@ def float32(value: float) -> float:
 
 
 class Params:
-    """Named numbers in sorted order; the position is the index in PARAM_VALUE.
+    """Named numbers; the position in the order of their names on the wire is PARAM_VALUE's index.
 
     An integer travels as its four bytes in the float field of PARAM_VALUE and PARAM_SET, so a peer
     that reads it as a number sees a denormal.
     """
 
-    def __init__(self, values: Mapping[str, float], integers: Collection[str] = ()) -> None:
-        """Store the values as INT32 where the name is in ``integers``, else as float32."""
-        self._values = {name: float32(values[name]) for name in sorted(values)}
+    def __init__(
+        self,
+        values: Mapping[str, float],
+        integers: Collection[str] = (),
+        renamed: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Store the values as INT32 where the name is in ``integers``, else as float32.
+
+        ``renamed``: names on the wire of those that have another one there.
+        """
+        self._values = {name: float32(values[name]) for name in values}
         self._integers = integers
-        self.names: tuple[str, ...] = tuple(self._values)
+        by_wire_name = {renamed.get(name, name): name for name in values}
+        self._by_wire_name = {name: by_wire_name[name] for name in sorted(by_wire_name)}
+        self.names: tuple[str, ...] = tuple(self._by_wire_name)
         """Names on the wire, in PARAM_VALUE's order."""
         self.changes = 0  # count of changes: PX4's modules do not learn which value changed
 
@@ -142,36 +152,29 @@ class Params:
         """Store the value. Return False for an unknown name or a value outside its type."""
         if name not in self._values or not math.isfinite(value):
             return False
-        if name in self._integers:
-            if not -_INT32_LIMIT <= value < _INT32_LIMIT:
-                return False
-            new: float = int(value)
-        else:
-            try:
-                new = float32(value)
-            except OverflowError:
-                return False
+        is_integer = name in self._integers
+        kind = "<i" if is_integer else "<f"
+        try:
+            (new,) = struct.unpack(kind, struct.pack(kind, int(value) if is_integer else value))
+        except (OverflowError, struct.error):
+            return False
         self.changes += new != self._values[name]
         self._values[name] = new
         return True
 
-    def kind(self, name: str) -> int:
-        """Return the MAV_PARAM_TYPE of PARAM_VALUE."""
-        is_integer = name in self._integers
-        return int(mav.MAV_PARAM_TYPE_INT32 if is_integer else mav.MAV_PARAM_TYPE_REAL32)
-
-    def on_wire(self, name: str) -> float:
-        """Return the value as the float field of PARAM_VALUE carries it."""
+    def on_wire(self, wire_name: str) -> tuple[float, int]:
+        """Return the float field and the MAV_PARAM_TYPE of PARAM_VALUE."""
+        name = self._by_wire_name[wire_name]
         if name not in self._integers:
-            return self._values[name]
+            return self._values[name], mav.MAV_PARAM_TYPE_REAL32
         (packed,) = struct.unpack("<f", struct.pack("<i", self.integer(name)))
-        return float(packed)
+        return packed, mav.MAV_PARAM_TYPE_INT32
 
-    def set_on_wire(self, name: str, packed: float) -> bool:
+    def set_on_wire(self, wire_name: str, packed: float) -> bool:
         """Store the float field of PARAM_SET. Return False if refused, like `set`."""
-        if name not in self._integers:
-            return self.set(name, packed)
-        (value,) = struct.unpack("<i", struct.pack("<f", packed))
+        name, value = self._by_wire_name.get(wire_name, ""), packed
+        if name in self._integers:
+            (value,) = struct.unpack("<i", struct.pack("<f", packed))
         return self.set(name, value)
 
 
