@@ -157,8 +157,7 @@ class ArduCopter(Autopilot):
             return "Radio failsafe on"
         if self.gcs_failsafe.active:
             return "GCS failsafe on"
-        throttle_us = self.rc.channels_us[self.rc.index_of("THROTTLE")]
-        if self.params["FS_THR_ENABLE"] and throttle_us < self.params["FS_THR_VALUE"]:
+        if self.params["FS_THR_ENABLE"] and self.rc.throttle_us < self.params["FS_THR_VALUE"]:
             return "Throttle below failsafe"
         return None
 
@@ -304,7 +303,7 @@ class ArduCopter(Autopilot):
             self._read_gesture()
         changed = self.radio_failsafe.update(
             new_input=new_input,
-            throttle_us=self.rc.channels_us[self.rc.index_of("THROTTLE")],
+            throttle_us=self.rc.throttle_us,
             can_fail=self.rc.found or self.armed,
             now_ns=self.now_ns,
         )

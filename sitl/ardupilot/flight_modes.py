@@ -22,54 +22,37 @@ HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the present position is 
 
 
 class Mode(IntEnum):
-    """Flight mode by its number in HEARTBEAT.custom_mode."""
+    """Flight mode: its number in HEARTBEAT.custom_mode, and what it has of the properties below."""
 
-    STABILIZE = 0
-    ALT_HOLD = 2
-    GUIDED = 4
-    LOITER = 5
-    RTL = 6
-    LAND = 9
-    POSHOLD = 16
-    BRAKE = 17
-    GUIDED_NOGPS = 20
+    STABILIZE = 0, "manual_throttle"
+    ALT_HOLD = 2, "climb_throttle"
+    GUIDED = 4, "is_guided needs_position"
+    LOITER = 5, "climb_throttle holds_position needs_position"
+    RTL = 6, "lands needs_position"
+    LAND = 9, "lands"
+    POSHOLD = 16, "climb_throttle holds_position needs_position"
+    BRAKE = 17, "holds_position needs_position"
+    GUIDED_NOGPS = 20, "is_guided"
 
-    @property
-    def manual_throttle(self) -> bool:
-        """True if the throttle stick is thrust: refused in RC failsafe, and down for arming."""
-        return self is Mode.STABILIZE
+    manual_throttle: bool  # the stick is thrust: refused in RC failsafe, and down for arming
+    climb_throttle: bool  # the stick is a climb rate, and holds the height when centred
+    is_guided: bool
+    holds_position: bool  # stops and holds: LOITER and POSHOLD at centred sticks, BRAKE always
+    needs_position: bool  # refused to an armed vehicle without a position
+    lands: bool  # ends on the ground; touching down stops the motors at once
+    piloted: bool
+    can_arm: bool
 
-    @property
-    def piloted(self) -> bool:
-        return self.manual_throttle or self.throttle_is_climb_rate
-
-    @property
-    def is_guided(self) -> bool:
-        return self in (Mode.GUIDED, Mode.GUIDED_NOGPS)
-
-    @property
-    def can_arm(self) -> bool:
-        return self.piloted or self.is_guided
-
-    @property
-    def throttle_is_climb_rate(self) -> bool:
-        """True if the throttle stick is a climb rate, and holds the height when centred."""
-        return self in (Mode.ALT_HOLD, Mode.LOITER, Mode.POSHOLD)
-
-    @property
-    def holds_position(self) -> bool:
-        """True for modes that stop and hold: LOITER and POSHOLD at centred sticks, BRAKE always."""
-        return self in (Mode.LOITER, Mode.POSHOLD, Mode.BRAKE)
-
-    @property
-    def needs_position(self) -> bool:
-        """True if the mode is refused to an armed vehicle without a position."""
-        return self in (Mode.RTL, Mode.GUIDED) or self.holds_position
-
-    @property
-    def lands(self) -> bool:
-        """True if the mode ends on the ground; touching down stops the motors at once."""
-        return self in (Mode.RTL, Mode.LAND)
+    def __new__(cls, number: int, properties: str = "") -> "Mode":
+        mode = int.__new__(cls, number)
+        mode._value_ = number
+        has = properties.split().__contains__
+        mode.manual_throttle, mode.climb_throttle = has("manual_throttle"), has("climb_throttle")
+        mode.is_guided, mode.lands = has("is_guided"), has("lands")
+        mode.holds_position, mode.needs_position = has("holds_position"), has("needs_position")
+        mode.piloted = mode.manual_throttle or mode.climb_throttle
+        mode.can_arm = mode.piloted or mode.is_guided
+        return mode
 
 
 class CopterControl:
@@ -112,7 +95,7 @@ class CopterControl:
         if mode.manual_throttle:
             return sticks.throttle > 0.0
         is_climb = pilot.climb_rate_mps(sticks, self._params) > 0.0
-        return mode.throttle_is_climb_rate and is_climb
+        return mode.climb_throttle and is_climb
 
     def fly(
         self, mode: Mode, sticks: Sticks, body: BodyState, now_ns: int, *, has_position: bool
@@ -148,7 +131,7 @@ class CopterControl:
         return self._attitude.lean(body, roll, pitch, yaw_rate)
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
-        if mode.throttle_is_climb_rate:
+        if mode.climb_throttle:
             return pilot.climb_rate_mps(sticks, self._params)
         if mode is Mode.BRAKE:
             return 0.0

@@ -61,12 +61,10 @@ class RcEngine:
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
         """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
         for index, value in enumerate(raw_us[:CHANNELS]):
-            if index < PRIMARY_CHANNELS:
-                if value != IGNORE:
-                    self._set(index, value, now_ns)
-            elif value == RELEASE_ON_AUX:
+            is_primary = index < PRIMARY_CHANNELS
+            if value == RELEASE_ON_AUX and not is_primary:
                 self._set(index, RELEASE, now_ns)
-            elif value not in (RELEASE, IGNORE):
+            elif value != IGNORE and (is_primary or value != RELEASE):
                 self._set(index, value, now_ns)
 
     def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
@@ -93,22 +91,24 @@ class RcEngine:
         """Return the zero-based channel of one of ``STICKS``, by RCMAP_* at boot."""
         return self._indices[axis]
 
+    @property
+    def throttle_us(self) -> int:
+        return self.channels_us[self.index_of("THROTTLE")]
+
     def sticks_us(self) -> tuple[int, int, int, int]:
         """Return the roll, pitch, throttle and yaw that the modes use [us], by RCMAP_*."""
-        roll, pitch, throttle, yaw = map(self.index_of, STICKS)
-        channels_us = self.channels_us
-        return channels_us[roll], channels_us[pitch], channels_us[throttle], channels_us[yaw]
+        roll, pitch, throttle, yaw = (self.channels_us[self.index_of(axis)] for axis in STICKS)
+        return roll, pitch, throttle, yaw
 
     def update(self, now_ns: int) -> bool:
         """Refresh ``channels_us``. Return True if receiver or overrides supplied a value."""
-        if self._receiver.frame(now_ns) is None and not self._fresh_override:
-            self._watch_switch(now_ns)
-            return False
-        self._fresh_override = False
-        values = [self._source(index, now_ns) for index in range(CHANNELS)]
-        for index, value in enumerate(values):
-            if value is not None:
-                self.channels_us[index] = value
+        values: list[int | None] = []
+        if self._receiver.frame(now_ns) is not None or self._fresh_override:
+            self._fresh_override = False
+            values = [self._source(index, now_ns) for index in range(CHANNELS)]
+            for index, value in enumerate(values):
+                if value is not None:
+                    self.channels_us[index] = value
         self._watch_switch(now_ns)
         return any(value is not None for value in values)
 
@@ -135,15 +135,13 @@ class RcEngine:
     def _watch_switch(self, now_ns: int) -> None:
         """Read the override switch: high allows overrides, low forbids them, the middle changes
         nothing."""
-        for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):
-            if self._params.integer(f"RC{channel}_OPTION") == _OPTION_OVERRIDE_SWITCH:
-                break
-        else:
-            return
-        if now_ns < self._switch_due_ns:
+        numbers = range(1, RC_CHANNELS_WITH_PARAMS + 1)
+        option = _OPTION_OVERRIDE_SWITCH
+        switches = [n for n in numbers if self._params.integer(f"RC{n}_OPTION") == option]
+        if not switches or now_ns < self._switch_due_ns:
             return
         self._switch_due_ns = now_ns + _SWITCH_PERIOD_NS
-        pwm_us = self.channels_us[channel - 1]
+        pwm_us = self.channels_us[switches[0] - 1]
         self._switch.see((1800 < pwm_us < 2200) - (900 < pwm_us < 1200), now_ns)
         if side := self._switch.take(now_ns):
             self._takes_overrides = side > 0
@@ -183,16 +181,12 @@ def _centred(rc: RcEngine, params: ArduPilotParams, axis: str) -> float:
     pwm = rc.channels_us[index]
     name = f"RC{index + 1}_"
     trim, dead_zone = params[name + "TRIM"], params[name + "DZ"]
-    if pwm == 0:
+    beyond = abs(pwm - trim) - dead_zone
+    if pwm == 0 or beyond <= 0.0:
         return 0.0
-    if pwm > trim + dead_zone:
-        offset, span = pwm - trim - dead_zone, params[name + "MAX"] - trim - dead_zone
-    elif pwm < trim - dead_zone:
-        offset, span = pwm - trim + dead_zone, trim - dead_zone - params[name + "MIN"]
-    else:
-        return 0.0
-    value = max(-1.0, min(1.0, offset / span)) if span > 0.0 else 0.0
-    return -value if params[name + "REVERSED"] else value
+    travel = params[name + "MAX"] - trim if pwm > trim else trim - params[name + "MIN"]
+    share = min(1.0, beyond / (travel - dead_zone)) if travel > dead_zone else 0.0
+    return math.copysign(share, (trim - pwm) if params[name + "REVERSED"] else (pwm - trim))
 
 
 def _throttle(rc: RcEngine, params: ArduPilotParams) -> tuple[float, float]:

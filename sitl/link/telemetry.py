@@ -125,14 +125,11 @@ class Telemetry(Generic[Ap]):
         return (present, enabled, healthy, 100, *battery, 0, 0, 0, 0, 0, 0)
 
     def _landed_state(self, *, is_landing: bool, is_taking_off: bool) -> int:
-        state = mav.MAV_LANDED_STATE_IN_AIR
         if self.ap.landed:
-            state = mav.MAV_LANDED_STATE_ON_GROUND
-        elif is_landing:
-            state = mav.MAV_LANDED_STATE_LANDING
-        elif is_taking_off:
-            state = mav.MAV_LANDED_STATE_TAKEOFF
-        return int(state)
+            return int(mav.MAV_LANDED_STATE_ON_GROUND)
+        if is_landing:
+            return int(mav.MAV_LANDED_STATE_LANDING)
+        return int(mav.MAV_LANDED_STATE_TAKEOFF if is_taking_off else mav.MAV_LANDED_STATE_IN_AIR)
 
 
 def _int16(values: Iterable[float], scale: float) -> list[int]:

@@ -119,20 +119,20 @@ class Px4(Commander):
         In modes with a climb rate its limit ramps up over MPC_TKO_RAMP_T from a negative value, so
         that the motors spin up before the vehicle moves.
         """
+        self.flight.most_climb_mps = math.inf
         if self._ramp_ns is not None:
-            share = (
-                (self.now_ns - self._ramp_ns) / NS_PER_S / max(0.1, self.params["MPC_TKO_RAMP_T"])
-            )
-            up_mps = self.params["MPC_Z_VEL_MAX_UP"]
-            self.flight.most_climb_mps = RAMP_FROM_MPS + share * (up_mps - RAMP_FROM_MPS)
-            if share >= 1.0:
-                self.flight.most_climb_mps, self._ramp_ns = math.inf, None
+            ramp_s = max(0.1, self.params["MPC_TKO_RAMP_T"])
+            share = (self.now_ns - self._ramp_ns) / NS_PER_S / ramp_s
+            rise_mps = share * (self.params["MPC_Z_VEL_MAX_UP"] - RAMP_FROM_MPS)
+            if share < 1.0:
+                self.flight.most_climb_mps = RAMP_FROM_MPS + rise_mps
+            else:
+                self._ramp_ns = None
         if not self.landed:
             return True
-        armed_ns = self.now_ns - self._armed_ns
-        sticks = self.stick_input.sticks
-        if armed_ns < self.params["COM_SPOOLUP_TIME"] * NS_PER_S or not self.flight.wants_takeoff(
-            self.mode, sticks, self.setpoint, self.sensed
+        is_spooled = self.now_ns - self._armed_ns >= self.params["COM_SPOOLUP_TIME"] * NS_PER_S
+        if not is_spooled or not self.flight.wants_takeoff(
+            self.mode, self.stick_input.sticks, self.setpoint, self.sensed
         ):
             self._ramp_ns, self.flight.most_climb_mps = None, math.inf
             return False

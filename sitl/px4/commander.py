@@ -111,12 +111,12 @@ class Commander(Autopilot):
                 "commander_arm_denied_resolve_failures",
             )
             return False
-        highest = 1.0
-        if self.intended.piloted:
-            highest = LOW_THROTTLE if self.intended.manual_throttle else MIDDLE_THROTTLE
-        throttle = self.stick_input.sticks.throttle
-        is_low_enough = throttle < highest if self.intended.manual_throttle else throttle <= highest
-        if not is_low_enough:
+        throttle, is_safe = self.stick_input.sticks.throttle, True
+        if self.intended.manual_throttle:
+            is_safe = throttle < LOW_THROTTLE
+        elif self.intended.piloted:
+            is_safe = throttle <= MIDDLE_THROTTLE
+        if not is_safe:
             self._deny(
                 "Arming denied: throttle not in safe position",
                 "commander_arm_denied_throttle_unsafe",
@@ -221,8 +221,8 @@ class Commander(Autopilot):
         """Let fast sticks take over an autonomous flight, except in a failsafe's Hold."""
         is_held = self.lost_sticks.phase is Phase.HOLDING
         bits = int(self.params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
-        is_autonomous = bool(bits & 1) and self.mode.is_auto
-        is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Px4Mode.OFFBOARD)
+        is_offboard = self.mode is Px4Mode.OFFBOARD
+        is_autonomous = bits & (1 if self.mode.is_auto else 2 if is_offboard else 0)
         if self.stick_input.moved_fast and is_autonomous and not is_held and not self.landed:
             was_failsafe = self.in_failsafe
             self._intend(Px4Mode.POSCTL if self.position_ready else Px4Mode.ALTCTL)

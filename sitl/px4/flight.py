@@ -124,7 +124,7 @@ class Px4Control:
                 body,
             )
         yaw_rate = self._stick_yaw(sticks if mode.piloted else Px4Sticks(), body)
-        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = self._heading_rad(body)
         if mode.manual_throttle:
             roll, pitch = pilot.lean_rad(sticks, self._params)
             thrust = pilot.manual_thrust(sticks, self._params, HOVER_THRUST)
@@ -152,7 +152,7 @@ class Px4Control:
         wanted = horizontal(setpoint.velocity_ned_mps)
         accel = self._accel_mps2 = self._horizontal.track(wanted, body)
         yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
-        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = self._heading_rad(body)
         thrust = self._climb(self._offboard_climb_mps(setpoint), body)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body)
 
@@ -176,13 +176,16 @@ class Px4Control:
         self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * STEP_S / lag_s
         return self._hold_yaw(self._yaw_rate_radps, body)
 
+    def _heading_rad(self, body: BodyState) -> float:
+        held_rad = self._yaw_hold_rad
+        return yaw_of(body.ned_from_body_wxyz) if held_rad is None else held_rad
+
     def _hold_yaw(self, yaw_rate_radps: float, body: BodyState) -> float:
         """Return the yaw rate; near zero, return 0 and hold the present heading."""
         if abs(yaw_rate_radps) > STILL_YAW_RADPS:
             self._yaw_hold_rad = None
             return yaw_rate_radps
-        if self._yaw_hold_rad is None:
-            self._yaw_hold_rad = yaw_of(body.ned_from_body_wxyz)
+        self._yaw_hold_rad = self._heading_rad(body)
         return 0.0
 
     def _climb(self, climb_mps: float, body: BodyState) -> float:

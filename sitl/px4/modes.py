@@ -72,7 +72,8 @@ _STREAM_LOST_MODES = {
     4: Px4Mode.AUTO_LAND,
     5: Px4Mode.AUTO_LOITER,
 }
-_EXCEPT_MISSION, _EXCEPT_AUTO, _EXCEPT_OFFBOARD = 1, 2, 4
+_EXCEPT, _EXCEPT_AUTO = {Px4Mode.AUTO_MISSION: 1, Px4Mode.OFFBOARD: 4}, 2
+"""Bits of COM_RCL_EXCEPT."""
 
 
 class Phase(Enum):
@@ -106,14 +107,10 @@ class LostSticks:
         return max(0.0, self._params["COM_FAIL_ACT_T"] - self._spent_s)
 
     def is_excepted(self, mode: Px4Mode) -> bool:
-        bits = self._params.integer("COM_RCL_EXCEPT")
         if mode in (Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND):
             return True
-        if mode is Px4Mode.AUTO_MISSION:
-            return bool(bits & _EXCEPT_MISSION)
-        if mode is Px4Mode.OFFBOARD:
-            return bool(bits & _EXCEPT_OFFBOARD)
-        return mode.is_auto and bool(bits & _EXCEPT_AUTO)
+        bit = _EXCEPT.get(mode, _EXCEPT_AUTO if mode.is_auto else 0)
+        return bool(self._params.integer("COM_RCL_EXCEPT") & bit)
 
     def start(self) -> None:
         self.phase = Phase.HOLDING if self.delay_s > 0.0 else Phase.ACTING
