@@ -19,6 +19,7 @@ from sitl.vehicle.rotation import (
     conjugate,
     horizontal,
     minus,
+    plus,
     rotate,
     wrap_pi,
     yaw_of,
@@ -263,7 +264,8 @@ class GateCounter:
     def __init__(self, course: Course, *, first: int = 0) -> None:
         self._course = course
         self._first = first
-        self._previous: tuple[Vec3, float] | None = None
+        self.position_ned_m: Vec3 | None = None  # the last one
+        self._last_s = 0.0
         self.passed: list[GatePass] = []
 
     @property
@@ -274,14 +276,14 @@ class GateCounter:
 
     def interrupt(self) -> None:
         """Start a new trajectory after a jump in position, for example a reboot."""
-        self._previous = None
+        self.position_ned_m = None
 
     def update(self, position_ned_m: Vec3, t_s: float) -> None:
         """Append a position; the path from the previous one counts as a straight line."""
-        previous, self._previous = self._previous, (position_ned_m, t_s)
-        if previous is None:
+        start_ned_m, self.position_ned_m = self.position_ned_m, position_ned_m
+        start_s, self._last_s = self._last_s, t_s
+        if start_ned_m is None:
             return
-        start_ned_m, start_s = previous
         reached = 0.0
         while (index := self.next_gate) is not None:
             gates = self._course.gates
@@ -327,29 +329,23 @@ def _is_near(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> bool:
 
 
 def _strikes(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> bool:
+    """True if the segment meets the frame, grown by the vehicle's radius.
+
+    Within the frame's outer box (slab method of Kay and Kajiya, 1986), the larger distance from the
+    passage's axis is greatest where the segment enters or leaves.
+    """
     start, end = gate.offset_m(start_ned_m), gate.offset_m(end_ned_m)
-    inner_m = gate.size_m / 2 - VEHICLE_RADIUS_M
     outer_m = gate.size_m / 2 + BAR_M + VEHICLE_RADIUS_M
-    thick_m = DEPTH_M / 2 + VEHICLE_RADIUS_M
-    bars = (
-        ((-thick_m, inner_m, -outer_m), (thick_m, outer_m, outer_m)),
-        ((-thick_m, -outer_m, -outer_m), (thick_m, -inner_m, outer_m)),
-        ((-thick_m, -outer_m, inner_m), (thick_m, outer_m, outer_m)),
-        ((-thick_m, -outer_m, -outer_m), (thick_m, outer_m, -inner_m)),
-    )
-    return any(_meets_box(start, end, low, high) for low, high in bars)
-
-
-def _meets_box(start: Vec3, end: Vec3, low: Vec3, high: Vec3) -> bool:
-    """True if a segment meets a closed axis-aligned box (slab method of Kay and Kajiya, 1986)."""
     enter, leave = 0.0, 1.0
-    for a, b, lowest, highest in zip(start, end, low, high, strict=True):
-        if a == b:
-            if not lowest <= a <= highest:
-                return False
-            continue
-        first, last = sorted(((lowest - a) / (b - a), (highest - a) / (b - a)))
-        enter, leave = max(enter, first), min(leave, last)
-        if enter > leave:
+    reaches_m = (DEPTH_M / 2 + VEHICLE_RADIUS_M, outer_m, outer_m)
+    for a, b, reach_m in zip(start, end, reaches_m, strict=True):
+        if a == b and abs(a) > reach_m:
             return False
-    return True
+        if a != b:
+            first, last = sorted(((-reach_m - a) / (b - a), (reach_m - a) / (b - a)))
+            enter, leave = max(enter, first), min(leave, last)
+    at_ends = (plus(start, minus(end, start), share) for share in (enter, leave))
+    inner_m = gate.size_m / 2 - VEHICLE_RADIUS_M
+    return enter <= leave and any(
+        max(abs(right), abs(down)) >= inner_m for _, right, down in at_ends
+    )

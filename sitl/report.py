@@ -49,7 +49,6 @@ class FlightLog:
         self._last_ns = self._path_due_ns = start_ns
         self._max_altitude_m = self._speed_mps = self._impact_mps = 0.0
         self._path_point_ned_m: Vec3 | None = None
-        self._position_ned_m: Vec3 | None = None
         self._was_touching = True
 
     @property
@@ -72,14 +71,14 @@ class FlightLog:
     def start_over(self, next_gate: int) -> None:
         """Restart the count at ``next_gate`` after the vehicle was placed elsewhere in the air."""
         self._gates = GateCounter(self._course, first=next_gate)
-        self._position_ned_m = self._path_point_ned_m = None
+        self._path_point_ned_m = None
         self._was_touching = False
         self.crash = None
 
     def on_reboot(self) -> None:
         """Start a new trajectory at the origin, which the vehicle did not fly to."""
         self._gates.interrupt()
-        self._position_ned_m = self._path_point_ned_m = None
+        self._path_point_ned_m = None
         self._was_touching = True
 
     def verdict(
@@ -130,7 +129,7 @@ class FlightLog:
         self._speed_mps = math.hypot(*body.velocity_ned_mps)
 
     def _check_gates(self, position_ned_m: Vec3, now_ns: int) -> None:
-        before_ned_m, self._position_ned_m = self._position_ned_m, position_ned_m
+        before_ned_m = self._gates.position_ned_m
         if self.crashed:
             return
         self._gates.update(position_ned_m, self._t_s(now_ns))
@@ -196,8 +195,7 @@ class _StickRecord:
         self._due_ns = ap.now_ns + STICK_PERIOD_NS
         body = ap.truth
         lean_rad = math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz))))
-        row: dict[str, Any] = {"t_s": t_s}
-        row |= zip(("us", "mode", "armed", "failsafe"), state, strict=True)
+        row = {"t_s": t_s, **dict(zip(("us", "mode", "armed", "failsafe"), state, strict=True))}
         row["lean_deg"] = round(math.degrees(lean_rad), 2)
         row["climb_mps"] = round(-body.velocity_ned_mps[2], 3)
         row["height_m"] = round(-body.position_ned_m[2], 3)
