@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mavbridge.core.course import CourseGate, read_gates
+from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.contract import QUATERNION, VELOCITY
 from policy.motion.rotation import matrix_columns
@@ -33,12 +34,6 @@ SKY, GROUND, GRID = (48, 38, 32), (58, 52, 46), (84, 76, 68)
 GATE, PATH, BODY = (0, 159, 230), (233, 180, 86), (245, 245, 245)
 COLOURS = ((0, 159, 230), (233, 180, 86), (115, 158, 0), (167, 121, 204))
 """BGR of the four actions, distinguishable for colour-blind readers (Okabe and Ito)."""
-NAMES = {
-    "sticks": ("throttle", "yaw", "pitch", "roll"),
-    "rates": ("thrust", "roll rate", "pitch rate", "yaw rate"),
-    "attitude": ("thrust", "roll", "pitch", "yaw rate"),
-    "velocity": ("x", "y", "z", "yaw rate"),
-}
 
 
 class FilmedFlight:
@@ -55,7 +50,7 @@ class FilmedFlight:
         self.heading = np.unwrap(np.arctan2(forward[1], forward[0]))
         self.right = np.stack(right, axis=1)
         self.sent = np.array([row["sent"] for row in rows])
-        self.names = NAMES[flight.meta.contract.action]
+        self.names = ACTION_CLASSES[flight.meta.contract.action]._fields
 
 
 class View:

@@ -33,7 +33,7 @@ class Received(NamedTuple):
 
 
 def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KINDS) -> "Transport":
-    """Open a link by its name, KIND:HOST:PORT or, as in MAVSDK, KIND://HOST:PORT.
+    """Open a link by its name, KIND:HOST:PORT.
 
     ``udpout`` sends first; ``udpin`` listens and answers all senders it has heard; ``tcpin`` serves
     clients, together or one after another; ``tcp`` connects at each send without a connection, so
@@ -43,9 +43,7 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
         UsageError: the name is malformed, the host is unknown or the port is taken.
     """
     kind, _, rest = url.partition(":")
-    host, _, port_text = rest.removeprefix("//").rpartition(":")
-    if kind == "udpin" and rest.startswith("//:"):
-        host = "127.0.0.1"
+    host, _, port_text = rest.rpartition(":")
     if kind not in kinds or not host or not port_text.isdecimal():
         wanted = ", ".join(f"{kind}:HOST:PORT" for kind in kinds)
         raise UsageError(f"link {url!r}: expected one of {wanted}")
@@ -188,7 +186,7 @@ HOST = "127.0.0.1"
 _LAYOUTS = {layout.size: layout for layout in (struct.Struct("<8H"), struct.Struct("<16H"))}
 
 
-class RcInput:
+class RcInput(UdpLink):
     """Local UDP port that takes receiver values, as ArduPilot's SITL does; never blocks.
 
     A datagram is 8 or 16 little-endian uint16, one PWM value in microseconds per channel. A 0
@@ -200,7 +198,7 @@ class RcInput:
 
     def __init__(self, port: int) -> None:
         try:
-            self._link = UdpLink((HOST, port), Clock(), listen=True)
+            super().__init__((HOST, port), Clock(), listen=True)
         except OSError as error:
             raise UsageError(f"--rc-in {port}: {_reason(error)}") from error
 
@@ -210,10 +208,7 @@ class RcInput:
         Datagrams of any other size are ignored.
         """
         newest = None
-        for received in self._link.drain():
+        for received in self.drain():
             if layout := _LAYOUTS.get(len(received.data)):
                 newest = layout.unpack(received.data)
         return newest
-
-    def close(self) -> None:
-        self._link.close()

@@ -5,6 +5,7 @@ policy generalises beyond this vehicle (Tobin et al., "Domain Randomization", 20
 `sitl.vehicle.looks` also changes colours, objects and weather.
 """
 
+import cmath
 import colorsys
 import math
 from collections.abc import Sequence
@@ -160,7 +161,7 @@ class Draw:
         return math.exp(self.offset(math.log(most)))
 
     def amount(self, most: float) -> float:
-        return float(self.random.uniform(0.0, most))
+        return self.between(0.0, most)
 
     def between(self, least: float, most: float) -> float:
         return float(self.random.uniform(least, most))
@@ -172,9 +173,7 @@ class Draw:
         return options[int(self.random.integers(len(options)))]
 
     def colour(self, ranges: Hsv) -> Rgb:
-        parts = colorsys.hsv_to_rgb(*self.random.uniform(*ranges))
-        red, green, blue = (round(255 * float(part)) for part in parts)
-        return (red, green, blue)
+        return _rgb_of(*self.random.uniform(*ranges).tolist())
 
     def tint(self, most: float) -> Vec3:
         """Return one factor each for red, green and blue."""
@@ -187,17 +186,21 @@ class Draw:
 
     def angle_rad(self) -> float:
         """Return any direction."""
-        return float(self.random.uniform(-math.pi, math.pi))
+        return self.offset(math.pi)
 
     def shade(self, rgb: Rgb) -> Rgb:
         """Return a similar colour: hue within 20 degrees, paler or darker."""
         hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
-        red, green, blue = colorsys.hsv_to_rgb(
+        return _rgb_of(
             (hue + self.offset(20.0) / 360.0) % 1.0,
             max(0.3, saturation - self.amount(0.35)),
             max(0.3, value - self.amount(0.3)),
         )
-        return (round(255 * red), round(255 * green), round(255 * blue))
+
+
+def _rgb_of(hue: float, saturation: float, value: float) -> Rgb:
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
+    return (round(255 * red), round(255 * green), round(255 * blue))
 
 
 def direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
@@ -215,11 +218,10 @@ def _vary_physics(nominal: Conditions, draw: Draw) -> Conditions:
         thrust_factor=draw.factor(1.1),
         drag_factor=draw.factor(1.5),
     )
-    wind_mps, towards_rad = draw.amount(4.0), draw.angle_rad()
-    north_mps, east_mps = wind_mps * math.cos(towards_rad), wind_mps * math.sin(towards_rad)
+    wind_mps = cmath.rect(draw.amount(4.0), draw.angle_rad())
     return replace(
         body,
-        wind_ned_mps=(north_mps, east_mps, draw.offset(0.3)),
+        wind_ned_mps=(wind_mps.real, wind_mps.imag, draw.offset(0.3)),
         gust_rms_mps=draw.amount(1.2),
         gust_time_s=1.5 * draw.factor(2.0),
         velocity_noise_mps=draw.amount(0.05),
@@ -241,7 +243,7 @@ def _vary_lens(nominal: Conditions, draw: Draw) -> Conditions:
 
 def _vary_scene(nominal: Conditions, draw: Draw) -> Conditions:
     azimuth_rad = draw.angle_rad()
-    elevation_rad = math.radians(float(draw.random.uniform(15.0, 80.0)))
+    elevation_rad = math.radians(draw.between(15.0, 80.0))
     first, second = nominal.gate_rgb
     return replace(
         nominal,
@@ -286,7 +288,7 @@ def _vary_firmware(nominal: Conditions, draw: Draw) -> Conditions:
 
 def _vary_streams(nominal: Conditions, draw: Draw) -> Conditions:
     """Draw stream timing; half of the links send every message at the requested rate."""
-    is_slow = draw.random.random() < 0.5
+    is_slow = draw.chance(0.5)
     slowdown_ms = round(draw.amount(23.0))
     return replace(
         nominal,
@@ -299,7 +301,7 @@ def _vary_streams(nominal: Conditions, draw: Draw) -> Conditions:
 def _vary_airframe_and_shutter(nominal: Conditions, draw: Draw) -> Conditions:
     """Draw drag from a racing frame's to that of PX4's SIH, 1 N per m/s; half of the frames keep
     the lower drag. Exposure and read-out reach those of a common 30 Hz rolling shutter camera."""
-    is_heavy = draw.random.random() < 0.5
+    is_heavy = draw.chance(0.5)
     heavy_nspm = 0.15 * math.exp(draw.amount(math.log(1.0 / 0.15)))
     return replace(
         nominal,
