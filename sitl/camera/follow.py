@@ -91,7 +91,9 @@ class PoseListener:
             mav.MAVLink_heartbeat_message(own_type, no_autopilot, 0, 0, mav.MAV_STATE_ACTIVE, 3)
         ]
         number, interval_us = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 1e6 / self._rate_hz
-        for kind in self._missing():
+        enough = self._rate_hz / 2
+        missing = [kind for kind in (QUATERNION, POSITION) if self._received[kind] < enough]
+        for kind in missing if self._vehicle is not None else ():
             to, params = (self._vehicle, mav.MAV_COMP_ID_AUTOPILOT1), (kind, interval_us)
             request = mav.MAVLink_command_long_message(*to, number, 0, *params, *[0.0] * 5)
             messages.append(request)
@@ -110,12 +112,6 @@ class PoseListener:
                 velocity_mps = (message.vx, message.vy, message.vz)
                 if all(map(math.isfinite, position_m + velocity_mps)):
                     self._position = (arrived_ns, position_m, velocity_mps)
-
-    def _missing(self) -> list[int]:
-        if self._vehicle is None:
-            return []
-        enough = self._rate_hz / 2
-        return [kind for kind in (QUATERNION, POSITION) if self._received[kind] < enough]
 
 
 def film_vehicle(

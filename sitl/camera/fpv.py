@@ -85,9 +85,7 @@ class FpvRenderer:
 
         The body rates have an effect if the conditions have an exposure or read-out time.
         """
-        eye_ned_m = np.array(position_ned_m, dtype=np.float64)
-        if any(self._offset_body_m):
-            eye_ned_m += rotate(ned_from_body_wxyz, self._offset_body_m)
+        eye_ned_m = np.add(position_ned_m, rotate(ned_from_body_wxyz, self._offset_body_m))
         eye_ned_m[2] = min(eye_ned_m[2], -LOWEST_EYE_M)
         ned_from_camera = rotation_matrix(ned_from_body_wxyz) @ self._body_from_camera
         image = self._draw_backdrop(eye_ned_m, ned_from_camera)
@@ -261,10 +259,8 @@ class _ImageSensor:
     def __init__(self, conditions: Conditions, width: int, height: int) -> None:
         self._random = np.random.Generator(np.random.PCG64((conditions.seed, 3)))
         gains = conditions.exposure * np.array(conditions.white_balance)
-        self._lut: Image | None = None
-        if (gains != 1.0).any():
-            levels = np.arange(256)[:, None] * gains
-            self._lut = np.clip(levels.round(), 0, 255).astype(np.uint8).reshape(1, 256, 3)
+        levels = np.arange(256)[:, None] * gains
+        self._lut = np.clip(levels.round(), 0, 255).astype(np.uint8).reshape(1, 256, 3)
         self._blur_px = conditions.blur_px * width / REFERENCE_WIDTH_PX
         self._noise: NDArray[np.int16] | None = None
         if conditions.image_noise > 0.0:
@@ -273,9 +269,8 @@ class _ImageSensor:
             self._noise = noise.round().astype(np.int16)
 
     def expose(self, image: Image) -> Image:
-        """Return the image [H, W, 3] RGB as recorded by the sensor; may be the argument itself."""
-        if self._lut is not None:
-            image = np.asarray(cv2.LUT(image, self._lut), dtype=np.uint8)
+        """Return the image [H, W, 3] RGB as recorded by the sensor."""
+        image = np.asarray(cv2.LUT(image, self._lut), dtype=np.uint8)
         if self._blur_px > 0.0:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), self._blur_px), dtype=np.uint8)
         if self._noise is not None:
