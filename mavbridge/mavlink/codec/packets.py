@@ -170,7 +170,8 @@ class Codec:
             self.bad_data_count += 1
             return None
         if self.signing is None:
-            self.hears_signed = self.hears_signed or frame.flags == SIGNED
+            # Noise rarely matches a checksum, but its message ids are unknown.
+            self.hears_signed |= frame.flags == SIGNED and frame.is_sound is True
         elif not self.signing.accepts(frame):
             return None
         body, layout, is_unusable = None, LAYOUTS.get(frame.message_id), False

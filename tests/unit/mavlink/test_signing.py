@@ -105,6 +105,7 @@ def v1_beats():
 
 
 UNKNOWN = bytes([0xFD, 5, 0, 0, 7, 1, 1, 0, 0, 1]) + b"noise" + bytes(2)
+SIGNED_NOISE = bytes([0xFD, 5, 1, 0, 7, 1, 1, 0, 0, 1]) + b"noise" + bytes(15)
 OTHER_STREAMS = beat(component=100), beat(link_id=3)
 LATE_TICKS = NOW_TICKS - MINUTE_TICKS
 
@@ -167,6 +168,7 @@ def test_what_is_rehearsed_uses_up_no_number_and_is_a_stream_of_its_own(key):
 def test_without_a_key_signed_packets_are_read_and_noticed():
     codec = make_codec(None)
     assert names(codec, attitude(make_vehicle(None))) == ["ATTITUDE_QUATERNION"]
+    assert list(codec.decode(SIGNED_NOISE))
     assert (codec.hears_signed, codec.refused_signatures) == (False, 0)
     for key in (KEY, None):  # it is remembered
         assert names(codec, attitude(make_vehicle(key))) == ["ATTITUDE_QUATERNION"]
