@@ -45,9 +45,11 @@ TABLES = ("contract", "schedule", "inputs", "outputs", "hidden")
 ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "policy.onnx"
 KINDS = f"{ENCODER} and {DENOISER}, {ENCODER} and {HEAD}, or {WHOLE} alone"
 _EXTERNAL = re.compile(
-    r"(?:externally stored data in file \(|data_full_path: )(.+), offset: ", re.S
+    r"(?:externally stored data in file \(|data_full_path: )(.+), offset: |"
+    r"resolves to '(.+)' which is outside the base directory",
+    re.S,
 )
-"""In an error of OpenVINO: the file whose external weights are missing."""
+"""In an error of OpenVINO: the file of external weights that is missing, or is elsewhere."""
 
 
 def is_ordered(names: Sequence[str], roles: Sequence[str]) -> bool:
@@ -223,6 +225,8 @@ def _lacking(path: Path, error: Exception) -> str | None:
     """Return what is wrong with a graph's external weights if that is why it was not read."""
     if (found := _EXTERNAL.search(str(error))) is None:
         return None
-    beside = path.parent / found[1]
+    beside = path.parent / (found[1] or found[2])
     what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
+    if found[2]:
+        what, advice = "in another folder", "put both files themselves, not links, into one folder"
     return f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"

@@ -316,6 +316,13 @@ def pointer(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 208\n")
 
 
+def linked(path: Path) -> None:
+    """As in the cache of Hugging Face."""
+    blobs = path.parent.with_name(f"{path.parent.name}-blobs")
+    blobs.mkdir()
+    path.symlink_to(path.rename(blobs / "weights"))
+
+
 def external_without_length(path: Path) -> None:
     """As ``external``; the entry "length" of the weights, which is optional, is left out."""
     external(path, Path.unlink)
@@ -375,6 +382,10 @@ REFUSED: dict[str, tuple[Write, str]] = {
     "external data a pointer": (
         partial(external, change=pointer),
         "data, .* is a pointer of Git LFS",
+    ),
+    "external data behind a link": (
+        partial(external, change=linked),
+        "weights, .* is in another folder: put both files themselves, not links",
     ),
     "external data of no length missing": (external_without_length, "is missing or cut short"),
     "output of no one size": (
