@@ -172,6 +172,10 @@ def decode_text(data: bytes) -> str:
     """Decode UTF-8 text, with or without a byte order mark; raise ValueError as ``read_text``."""
     if data.strip() and (found := stand_in_of(data)) is not None:
         raise ValueError(f"it is {found[0]}: {found[1]}")
+    if b"\0" in data:
+        raise ValueError(
+            "it holds zero bytes, as UTF-16 or after a loss of power: save it as UTF-8"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -188,6 +192,8 @@ def _require_small_numbers(text: str) -> None:
 def parse_json(text: str) -> Any:
     """Parse JSON; raise ValueError for deep nesting and integers that no float can hold, too."""
     _require_small_numbers(text)
+    if not text.strip():
+        raise ValueError("it is empty, or cut short")
     try:
         return json.loads(text)
     except RecursionError as error:

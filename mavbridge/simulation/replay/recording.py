@@ -34,6 +34,7 @@ from mavbridge.recording.replay_files import (
 from mavbridge.recording.rows import TickRow
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
+from policy.files import why_unreadable
 
 STAMP_NS = 10 * NS_PER_MS
 """Largest difference between a packet's two stamps: the log's are rounded to 4 us, and wall clock
@@ -97,6 +98,8 @@ def open_source(folder: Path) -> ReplaySource:
     stamps = list(read_packets(read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)))
     log, skipped = read_tlog(folder / TLOG)
     offset_ns = settings.wall_offset_ns
+    if skipped and not log:
+        raise UserError(why_unreadable(folder / TLOG, ValueError("no MAVLink in it")))
     if skipped:
         damage.append(
             f"{folder / TLOG} is damaged, or of another MAVLink dialect: {skipped} bytes were "

@@ -18,9 +18,9 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
             open_regular(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,", f"{10**400}"])
-def test_json_that_is_too_deep_or_has_huge_numbers_is_a_value_error(text: str) -> None:
-    with pytest.raises(ValueError, match=r"nested too deeply|Expecting value|308 digits"):
+@pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,", f"{10**400}", "\n"])
+def test_json_that_is_empty_too_deep_or_has_huge_numbers_is_a_value_error(text: str) -> None:
+    with pytest.raises(ValueError, match=r"nested too deeply|Expecting value|308 digits|is empty"):
         parse_json(text)
 
 
@@ -34,7 +34,8 @@ def test_json_that_is_too_deep_or_has_huge_numbers_is_a_value_error(text: str) -
         (b"\xff\xfe", "UTF-16 or UTF-32"),
         (b"a = 1\nb = '\xe4'", "not UTF-8 text .line 2"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
-        (b"a = \0", "Invalid"),
+        (b"a = \0", "zero bytes"),
+        ("a = 1".encode("utf-16-le"), "UTF-16"),
         (b"\na = 1_0" + b"0" * 400, "more than 308 digits .line 2"),
     ],
 )

@@ -143,6 +143,9 @@ def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
     told = json.loads(written.read_text())["gaps"]
     assert re.search(r"link.tlog is damaged.*: 5\d\d bytes were skipped", told[0])
     assert re.search(r"\d+ packets are not in the recording", told[1])
+    (folder / "link.tlog").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(UserError, match=r"link\.tlog is a pointer of Git LFS"):
+        replay(folder, ReplayConfig())
     (folder / "link.tlog").unlink()
     with pytest.raises(UserError, match=r"link\.tlog"):
         replay(folder, ReplayConfig())
