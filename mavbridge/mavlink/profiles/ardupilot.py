@@ -20,6 +20,7 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     map_notes,
     stick_names,
     stick_notes,
+    takeoff_notes,
 )
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
@@ -63,8 +64,9 @@ _FIRST_NAMES = (
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER", "Q_ENABLE"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
-    *("MAV_GCS_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "PILOT_SPD_DN"),
-    *("SYSID_MYGCS", "ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_SPEED_DN"),  # the same up to 4.6
+    *("MAV_GCS_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "PILOT_SPD_DN", "PILOT_TKO_ALT_M"),
+    # the same up to 4.6
+    *("SYSID_MYGCS", "ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_SPEED_DN", "PILOT_TKOFF_ALT"),
     *(f"RC{number}_OPTION" for number in OPTION_CHANNELS),
 )
 """Parameters to read first; RCMAP_* then selects the RCn_MIN etc. to read."""
@@ -194,6 +196,7 @@ def _override_notes(
         yield ParamNote.of("obstacle", "RC_OPTIONS", options, effect, mended)
     yield from map_notes(values, context.booted)
     yield from stick_notes(values)
+    yield from takeoff_notes(values)
     yield from _timeout_notes(values, context)
     for names, unknown in (
         (_RISK_NAMES, "it holds its last sticks for ever if this computer dies"),

@@ -221,6 +221,14 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
         yield ParamNote.of("obstacle", "FLTMODE_CH", channel, effect, free)
 
 
+def takeoff_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
+    """Yield the height, up to 10 m, to which the first climb by the throttle goes by itself."""
+    for name in ("PILOT_TKO_ALT_M", "PILOT_TKOFF_ALT"):
+        if height := values.get(name, 0):
+            effect = ": a takeoff by the throttle goes on to that height by itself"
+            yield ParamNote.of("advice", name, height, effect, 0)
+
+
 def is_simple_setting(name: str, value: float) -> bool:
     """True if this parameter can put the vehicle into Simple mode."""
     is_option = name.endswith("_OPTION") and value in _SIMPLE_OPTIONS

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from helpers.parameters import SAFE
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.vehicle import ActionKind, Output
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
@@ -124,6 +125,12 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
         (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "attitude", True, ["ATC_ANGLE_BOOST is 0"]),
         (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "rates", True, []),
         (ARDUPILOT, {"GUID_TIMEOUT": 3.0, "ATC_ANGLE_BOOST": 0.0}, None, False, []),
+        (ARDUPILOT, SAFE, "rc-override", True, []),
+        *(
+            (ARDUPILOT, SAFE | {name: 9.0}, "rc-override", True, [f"--set {name}=0"])
+            for name in ("PILOT_TKO_ALT_M", "PILOT_TKOFF_ALT")
+        ),
+        (ARDUPILOT, {"PILOT_TKO_ALT_M": 9.0}, "velocity", True, []),
         (PX4, {"COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}, "manual-control", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0}, "manual-control", None, ["--set COM_RC_LOSS_T=0.5"]),
         (PX4, {"COM_RC_LOSS_T": 0.1}, "manual-control", None, ["as short as that is a failsafe"]),
