@@ -14,6 +14,7 @@ from helpers.output_flights import HOVERING, OutputFlight
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FeatureFrame, Solve, Tick, TickSink, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
 from mavbridge.flight.action_frames import ActionFrame
@@ -234,9 +235,19 @@ def lose_connection(flight: OutputFlight) -> None:
     flight.run(0.8)
 
 
+def fall_silent(flight: OutputFlight) -> None:
+    """The grace ends between two slots, and is found to by the next word of the flight process."""
+    flight.down.is_silent = True
+    while flight.phase is Phase.FLYING:
+        flight.run(0.0037)
+        flight.tell(because(Code.NO_CHUNK))
+    flight.down.is_silent = False
+
+
 @pytest.mark.parametrize(
     ("autopilot", "action", "end"),
     [
+        ("ardupilot", "sticks", fall_silent),
         ("px4", "sticks", hold_and_quit),
         ("px4", "sticks", OutputFlight.return_nan),
         ("ardupilot", "velocity", lose_camera),

@@ -198,7 +198,9 @@ def _absences(source: ReplaySource, period_ns: int) -> Iterator[tuple[int, Reaso
     """Yield when and why the guard was told that there is no usable chunk.
 
     Such a pass has no tick, but the reason for the end tells of it: the last malformed chunks come
-    with the tick that ends the flight, another absence when it ends the grace at that tick.
+    with the tick that ends the flight, another absence when it ends the grace at that tick. An end
+    between two slots needs a message of the flight process, or has other causes: one more absence
+    does not change those.
     """
     shortening_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns) - period_ns
     taken_ns = serial = 0
@@ -211,13 +213,14 @@ def _absences(source: ReplaySource, period_ns: int) -> Iterator[tuple[int, Reaso
         said = next(iter(reason.inner), None)
         if reason.code is Code.UNUSABLE_CHUNKS and said is not None:
             yield from ((at_ns - left, said) for left in reversed(range(MAX_REFUSED)))
-        elif reason.code in (Code.LATE, Code.PAST_HORIZON):
+            continue
+        if reason.code in (Code.LATE, Code.PAST_HORIZON):
             if any(serial < each.serial and each.computed_ns < at_ns for each in source.solves):
                 said = said or because(Code.NO_CHUNK)  # they were too old
             if said is not None:
                 yield max(taken_ns + 1, at_ns - 1 - shortening_ns), said
-                if not tick.is_slot:  # the last of them caused this pass
-                    yield at_ns, said
+        if not tick.is_slot:
+            yield at_ns, said or because(Code.NO_CHUNK)
 
 
 def _is_seen(solve: Solve, tick: Tick, after: Tick | None) -> bool:
