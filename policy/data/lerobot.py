@@ -4,6 +4,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -379,13 +380,16 @@ def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
     """Yield the images of a table, PNG or JPEG; LeRobot's cells are ``{"bytes", "path"}``."""
     table = _read_table(row.data, ["episode_index", info.camera])
     for number, cell in enumerate(_rows_of(table, row)[info.camera].to_pylist()):
-        encoded = cell.get("bytes") if isinstance(cell, dict) else cell
+        encoded: Any = cell.get("bytes") if isinstance(cell, dict) else cell
         bgr = None
-        if isinstance(encoded, bytes) and encoded:
+        with suppress(cv2.error, TypeError):  # nothing in it, too many pixels, or no bytes
             bgr = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:
+            found = "not a PNG or JPEG in the table that can be decoded"
+            if isinstance(cell, dict) and cell.get("path") and encoded is None:
+                found = f"not in the table, which has its path alone ({cell['path']})"
             raise DatasetError(
-                f"{row.name}: the image of row {number} is not a PNG or JPEG in the table that can "
-                "be decoded: copy the dataset again, or save it again with LeRobot"
+                f"{row.name}: the image of row {number} is {found}: copy the dataset again, or "
+                "save it again with LeRobot"
             )
         yield cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

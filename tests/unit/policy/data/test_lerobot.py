@@ -1,6 +1,8 @@
 """LeRobot datasets of somebody else: what is taken, what is refused and with which words."""
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -231,9 +233,23 @@ def test_a_video_that_ends_early_is_refused(tmp_path: Path) -> None:
         list(second.decode())
 
 
-@pytest.mark.parametrize("encoded", [None, b"", b"no image"])
-def test_an_image_that_cannot_be_used_is_named(encoded: bytes | None, tmp_path: Path) -> None:
+def huge_png() -> bytes:
+    """Return a picture of one pixel whose header says 60,000 x 60,000."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    small = cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()
+    return small[:12] + header + struct.pack(">I", zlib.crc32(header)) + small[33:]
+
+
+@pytest.mark.parametrize(
+    ("encoded", "says"),
+    [
+        (None, r"not in the table, .* alone \(2\.png\)"),
+        (b"", "not a PNG"),
+        (huge_png(), "not a PNG"),
+    ],
+)
+def test_an_image_that_cannot_be_used_is_named(encoded, says, tmp_path: Path) -> None:
     root = write(tmp_path / "a", kind="image")
     _rows(CAMERA, lambda cells: [*cells[:2], {"bytes": encoded, "path": "2.png"}, *cells[3:]])(root)
-    with pytest.raises(DatasetError, match="episode 0: the image of row 2 is not a PNG"):
+    with pytest.raises(DatasetError, match=f"episode 0: the image of row 2 is {says}"):
         list(read_dataset(root)[0].decode())
