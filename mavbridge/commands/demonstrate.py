@@ -68,7 +68,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
         contract, student = _terms(spec, longest_solve_ns, flight.clock, stack)
         pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
         meta = _meta(spec, variation, pilot.runner, flight.clock.now_ns())
-        writer = FlightWriter(spec.folder, meta, with_labels=True)
+        writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
         stack.callback(writer.close)
         result = flight.fly(
             pilot.runner,
@@ -81,6 +81,8 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
         log = flight.vehicle.log
         success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
         writer.finish(replace(writer.meta, success=success, gates_passed=result.gates_passed))
+        if writer.video_failure is not None:
+            raise writer.video_failure
     return success
 
 

@@ -2,12 +2,12 @@
 
     vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks
                                                                          |
-                                                 VideoWriter: frames through shared memory
+                                      VideoWriter: frames through shared memory, rows by pipe
                                                                          v
                                             writer process --> camera.mp4
     process of the link --open_tlog_pipe--> writer process --> link.tlog
 
-``FlightWriter`` alone records flights that need not run in real time (demonstrations), and encodes
-their images itself. ``open_flight`` reads a recording back, also after a crash. The loops do not
-import this package.
+``FlightWriter`` alone, in the offline mode, records flights that need not run in real time
+(demonstrations). ``VideoWriter`` alone makes one video of frames from any source (rollouts).
+``open_flight`` reads a recording back, also after a crash. The loops do not import this package.
 """

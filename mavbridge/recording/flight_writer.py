@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -33,9 +33,8 @@ from mavbridge.recording.rows import (
 )
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogPipe
-from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 from mavbridge.recording.video_process import VideoJob
-from mavbridge.recording.video_writer import VideoWriter, WriterDiedError, WriterError
+from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError, WriterError
 
 PACKET_CAPACITY = 60_000
 """Capacity of the queue of packet stamps: one minute of the busiest link."""
@@ -61,7 +60,7 @@ class _Camera:
 
     name: str | None
     """Name in file names; None for the first camera."""
-    video: VideoWriter | FragmentedMp4
+    video: VideoWriter
     features: TableWriter | None = None
     frames: TableWriter | None = None
     """Created with the first frame."""
@@ -84,17 +83,15 @@ class FlightWriter:
         folder: Path,
         meta: FlightMeta,
         *,
-        is_live: bool = False,
+        pressure: Pressure,
         with_labels: bool = False,
         settings: ReplaySettings | None = None,
         tlog_pipe: TlogPipe | None = None,
     ) -> None:
-        """Create the files in a folder from ``prepare_folder``.
+        """Create the files in a folder from ``prepare_folder``, and start the writer process.
 
-        ``is_live``: processes of their own write the videos, so that no encoder delays the loops,
-        and drop images rather than wait. ``with_labels`` adds columns for the expert and
-        ``FrameTruth``, ``settings`` the files for a replay. The reader of ``tlog_pipe`` becomes
-        ``link.tlog`` and is closed here.
+        ``with_labels`` adds columns for the expert and ``FrameTruth``, ``settings`` the files for a
+        replay. The reader of ``tlog_pipe`` becomes ``link.tlog`` and is closed here.
         """
         self._folder = folder
         self.meta = meta
@@ -110,7 +107,7 @@ class FlightWriter:
         self._packet_serials, self._packets_dropped = SerialNumbers(), 0
         try:
             with self._writing():
-                self._start_videos(tlog_pipe, is_live=is_live)
+                self._start_videos(pressure, tlog_pipe)
                 write_meta(folder, meta)
                 if settings is not None:
                     replay_files.write_settings(folder, settings)
@@ -119,13 +116,12 @@ class FlightWriter:
             self.close()
             raise
 
-    def _start_videos(self, tlog_pipe: TlogPipe | None, *, is_live: bool) -> None:
+    def _start_videos(self, pressure: Pressure, tlog_pipe: TlogPipe | None) -> None:
         tlog = None if tlog_pipe is None else tlog_pipe.reader
         for name in (None, *self.meta.contract.cameras[1:]):
             of_first = tlog if name is None else None
             job = VideoJob(self._folder / video_of(name), self.meta.visual_hz, of_first)
-            video = VideoWriter(job) if is_live else FragmentedMp4(job.video, job.hz)
-            self._cameras.append(_Camera(name, video))
+            self._cameras.append(_Camera(name, VideoWriter(job, pressure=pressure)))
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
         self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
@@ -158,10 +154,10 @@ class FlightWriter:
         if camera.features is not None and vision.feature is not None:
             camera.features.add(replay_files.feature_columns(vision, vision.feature, dropped))
         self._flush_if_due(vision.ready_ns)
-        with self._writing():
-            if not self._act(camera, lambda video: video.append(vision.rgb, vision.captured_ns)):
-                return
-            if camera.frames is None:
+        if not self._act(camera, lambda video: video.submit(vision.rgb, vision.captured_ns)):
+            return
+        if camera.frames is None:
+            with self._writing():
                 camera.frames = self._table(of_camera(FRAMES, camera.name), self._frames_schema)
         row = FrameRow(
             frame_id=vision.frame_id,
@@ -172,9 +168,7 @@ class FlightWriter:
         )
         camera.frames.add(frame_columns(row))
 
-    def _act(
-        self, camera: _Camera, act: Callable[[VideoWriter | FragmentedMp4], bool | None]
-    ) -> bool | None:
+    def _act(self, camera: _Camera, act: Callable[[VideoWriter], bool | None]) -> bool | None:
         """Use the writer of a camera; its death, which loses only its frames, returns None."""
         if not camera.is_dead:
             try:
@@ -199,10 +193,10 @@ class FlightWriter:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Context manager: raise WriterError for an error of writing."""
+        """Context manager: raise WriterError for an OSError."""
         try:
             yield
-        except WRITE_ERRORS as error:
+        except OSError as error:
             reason = os.strerror(error.errno) if error.errno else error
             raise WriterError(f"{self._folder} cannot be written: {reason}") from error
 
@@ -249,8 +243,8 @@ class FlightWriter:
             with self._writing():
                 for table in self._tables:
                     table.finish()
-                for camera in self._cameras:
-                    self._act(camera, lambda video: video.finish())
+            for camera in self._cameras:
+                self._act(camera, lambda video: video.finish())
         except BaseException:
             self.close()
             raise
@@ -270,7 +264,6 @@ class FlightWriter:
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""
         for camera in self._cameras:
-            with suppress(*WRITE_ERRORS):  # a disk that was full is still full
-                camera.video.close()
+            camera.video.close()
         for table in self._tables:
             table.abandon()

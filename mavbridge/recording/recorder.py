@@ -57,7 +57,9 @@ class Recorder(ObserverThread):
             WriterError: a file cannot be written, or the writer process does not start.
         """
         self._folder = folder
-        writer = FlightWriter(folder, meta, is_live=True, settings=settings, tlog_pipe=tlog_pipe)
+        writer = FlightWriter(
+            folder, meta, pressure="online", settings=settings, tlog_pipe=tlog_pipe
+        )
         self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
         self.start(self._flight)
 

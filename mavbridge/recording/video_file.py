@@ -48,10 +48,6 @@ class FragmentedMp4:
         self._file: BinaryIO | None = None
         self._first_ns: int | None = None
         self._last_pts = -1
-        self.written = 0
-        """Number of images in the file."""
-        self.misfit: str | None = None
-        """See ``VideoWriter``; here an image of another size is scaled."""
 
     def _open(self, image: CameraImage) -> BinaryIO:
         self._file = file = self._path.open("xb", buffering=_BUFFER_BYTES)
@@ -68,14 +64,11 @@ class FragmentedMp4:
         self._stream.codec_context.time_base = TIME_BASE
         return file
 
-    def append(self, image: CameraImage, captured_ns: int) -> bool:
-        """Encode one frame and hand it to the kernel. Returns True: none is dropped.
+    def append(self, image: CameraImage, captured_ns: int) -> None:
+        """Encode one frame with even sides and hand it to the kernel.
 
-        An odd last row or column is cut off, which H.264 cannot have. A stamp not later than the
-        last frame's is moved behind it.
+        A stamp not later than the last frame's is moved behind it.
         """
-        height, width = image.shape[:2]
-        image = image[: height // 2 * 2, : width // 2 * 2]
         file = self._file or self._open(image)
         if self._first_ns is None:
             self._first_ns = captured_ns
@@ -86,12 +79,6 @@ class FragmentedMp4:
         self._container.mux(self._stream.encode(frame))
         file.flush()
         self._last_pts = pts
-        self.written += 1
-        return True
-
-    def finish(self) -> None:
-        """See ``close``."""
-        self.close()
 
     def close(self) -> None:
         """Write the remaining data and close the file, also after an error. Can be called twice."""

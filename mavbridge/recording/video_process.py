@@ -149,12 +149,12 @@ ToWriter: TypeAlias = Ring | Submit | Notice
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
-def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
+def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness: int) -> None:
     """Entry point of the process."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    os.nice(NICENESS)
+    os.nice(niceness)
     service = WriterService(pipe, job)
     service.send(Notice.READY)
     while service.is_open:

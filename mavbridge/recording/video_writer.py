@@ -7,10 +7,12 @@ from collections import deque
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Literal
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.video_process import (
+    NICENESS,
     Failed,
     FromWriter,
     Notice,
@@ -24,6 +26,9 @@ from mavbridge.recording.video_process import (
     run_writer,
     send_descriptor,
 )
+
+Pressure = Literal["online", "offline"]
+"""With a full ring, online drops and counts the frame; offline makes the producer wait."""
 
 START_S = 30.0
 STALL_S = 30.0
@@ -42,16 +47,19 @@ class WriterDiedError(WriterError):
 
 
 class VideoWriter:
-    """One video, written by a separate process, which yields the CPU to all others. Used by one
-    thread.
+    """One video, written by a separate process. Used by one thread.
 
     Methods raise ``WriterError`` if the process has failed or died. If the producer is killed, the
     process notices and finishes the video. It outlives ``finish`` if the link's log has not ended
     by then, and waits for that by itself.
     """
 
-    def __init__(self, job: VideoJob) -> None:
-        """Start the process and wait until it runs. The pipe of the job's log is closed here."""
+    def __init__(self, job: VideoJob, *, pressure: Pressure) -> None:
+        """Start the process and wait until it runs. The pipe of the job's log is closed here.
+
+        ``pressure``: behaviour with a full ring. Online, the process yields the CPU to all others.
+        """
+        self._pressure: Pressure = pressure
         self._slots: CameraImage | None = None
         """Memory for frames; None before the first and after ``close``."""
         self._free: deque[int] = deque()
@@ -62,7 +70,7 @@ class VideoWriter:
         self.written = 0
         """Number of frames known to be in the file."""
         self._keeps_log = job.tlog is not None
-        self._pipe, self._process = start_process(job)
+        self._pipe, self._process = start_process(job, NICENESS if pressure == "online" else 0)
         # A policy's forks must not hide the producer's death from the writer.
         os.register_at_fork(after_in_child=self._pipe.close)
         # A producer that ends without ``close`` must not wait for its writer.
@@ -73,11 +81,11 @@ class VideoWriter:
             self.close()
             raise
 
-    def append(self, rgb: CameraImage, captured_ns: int) -> bool:
+    def submit(self, rgb: CameraImage, captured_ns: int) -> bool:
         """Hand a frame over; the caller can overwrite it afterwards. False: it was dropped.
 
-        A frame is dropped if the ring is full; and if it differs in size or kind from the first, or
-        is one pixel high or wide: see ``misfit``.
+        A frame that differs in size or kind from the first, or is one pixel high or wide, is a bug
+        offline; online, it is dropped: see ``misfit``.
 
         Args:
             rgb: the image. An odd last row or column is cut off, which H.264 cannot have.
@@ -92,6 +100,8 @@ class VideoWriter:
         if slots is None or rgb.shape != slots.shape[1:]:
             self._see_misfit(height, width)
             slots = None
+        elif self._pressure == "offline":
+            self._wait_until(lambda: bool(self._free))
         if slots is None or not self._free:
             return False
         slot = self._free.popleft()
@@ -105,6 +115,8 @@ class VideoWriter:
         else:
             before = f"{self._slots.shape[2]}x{self._slots.shape[1]}"
             what = f"the camera's images have changed from {before} to {width}x{height}"
+        if self._pressure == "offline":
+            raise ValueError(what)
         self.misfit = self.misfit or what
 
     def _open(self, rgb: CameraImage) -> CameraImage:
@@ -192,12 +204,14 @@ class VideoWriter:
             self._process.join(END_S)
 
 
-def start_process(job: VideoJob) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
+def start_process(
+    job: VideoJob, niceness: int
+) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
     """Start the writer's process; return the pipe to it and the process."""
     context = multiprocessing.get_context("spawn")  # not fork: this process has running threads
     pipe, its_pipe = context.Pipe()
     process = context.Process(
-        target=run_writer, args=(its_pipe, job), name="mavbridge-writer", daemon=True
+        target=run_writer, args=(its_pipe, job, niceness), name="mavbridge-writer", daemon=True
     )
     try:
         process.start()

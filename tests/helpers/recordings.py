@@ -1,4 +1,4 @@
-"""Flights to record: images that show their number, and a meta."""
+"""Flights to record: images that show their number, a meta, and a writer without a process."""
 
 import os
 import resource
@@ -8,14 +8,18 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from helpers.factories import START_NS, make_vision_tick
 from mavbridge.core.records import CameraImage, ImageArray, Tick, VisionTick
+from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.video_file import FragmentedMp4
+from mavbridge.recording.video_process import VideoJob
 from policy.contract import Contract
 from policy.data.flight_video import decode_images, video_parts
 
@@ -78,6 +82,35 @@ def make_meta(**changes: Any) -> FlightMeta:
     return replace(meta, **changes)
 
 
+class InProcessWriter:
+    """Replaces ``VideoWriter`` where its process is not under test: starting it takes a second."""
+
+    def __init__(self, job: VideoJob, *, pressure: str) -> None:
+        if job.tlog is not None:
+            job.tlog.close()
+        self._video = FragmentedMp4(job.video, job.hz)
+        self.written = 0
+
+    def submit(self, rgb: CameraImage, captured_ns: int) -> bool:
+        height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
+        self._video.append(rgb[:height, :width], captured_ns)
+        self.written += 1
+        return True
+
+    def finish(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._video.close()
+
+
+@contextmanager
+def without_writer_process() -> Iterator[None]:
+    """Context manager: write flights in the calling thread."""
+    with patch.object(flight_writer, "VideoWriter", InProcessWriter):
+        yield
+
+
 @contextmanager
 def disk_of(limit_bytes: int) -> Iterator[None]:
     """No file of this process grows beyond that."""
@@ -106,15 +139,16 @@ def write_recording(
 ) -> Path:
     """A flight of ``events``; without ``finish``, as a kill leaves it."""
     folder.mkdir()
-    writer = FlightWriter(folder, meta or make_meta())
-    for event in events:
-        if isinstance(event, Tick):
-            writer.tick(event)
+    with without_writer_process():
+        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+        for event in events:
+            if isinstance(event, Tick):
+                writer.tick(event)
+            else:
+                writer.frame(event)
+        if finish:
+            writer.finish(writer.meta)
         else:
-            writer.frame(event)
-    if finish:
-        writer.finish(writer.meta)
-    else:
-        writer.flush()
-        writer.close()
+            writer.flush()
+            writer.close()
     return folder

@@ -4,7 +4,7 @@
                               ^                                              |          and states
                               '--- exe_steps of them; pixels if needed ------+
                                                                              v  bounded queue
-                                               rollout.mp4 <-- decode thread
+                           rollout.mp4 <-- writer process <-- decode thread (or CUDA side stream)
                            rollout.parquet
 
 ``loop.rollout`` is the loop and does not use files. ``StreamedOutput`` writes its segments as they

@@ -10,6 +10,7 @@ import pytest
 
 from helpers.factories import make_tick
 from helpers.recordings import (
+    InProcessWriter,
     disk_of,
     make_frame,
     make_meta,
@@ -22,7 +23,6 @@ from mavbridge.core.records import FlightOutcome, ImageArray, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import FlightError, prepare_folder, read_meta, write_meta
-from mavbridge.recording.video_file import FragmentedMp4
 from mavbridge.recording.video_writer import WriterError
 from policy.contract import Contract
 
@@ -88,12 +88,12 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
 def test_a_frame_that_the_video_does_not_take_is_told_by_the_next_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    append = FragmentedMp4.append
+    submit = InProcessWriter.submit
 
-    def take_some(self: FragmentedMp4, rgb: ImageArray, captured_ns: int) -> bool:
-        return number_of(rgb) not in (0, 3, 4, 9) and append(self, rgb, captured_ns)
+    def take_some(self: InProcessWriter, rgb: ImageArray, captured_ns: int) -> bool:
+        return number_of(rgb) not in (0, 3, 4, 9) and submit(self, rgb, captured_ns)
 
-    monkeypatch.setattr(FragmentedMp4, "append", take_some)
+    monkeypatch.setattr(InProcessWriter, "submit", take_some)
     recorded = [make_frame(number, serial=number + (number > 5)) for number in range(10)]
     back = open_flight(write_recording(tmp_path / "flight", recorded))
     assert [row.frame_id - 1 for row in back.frame_rows()] == [1, 2, 5, 6, 7, 8]

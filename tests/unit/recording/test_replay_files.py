@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.factories import START_NS, make_solve, make_state
-from helpers.recordings import make_frame, make_meta
+from helpers.recordings import make_frame, make_meta, without_writer_process
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.policy import PolicyConfig, Rates
 from mavbridge.core.reasons import Code, because, reason_to_json
@@ -62,8 +62,9 @@ def comparable(solve: Solve) -> tuple[object, ...]:
 
 
 def record(folder: Path, **changes: Any) -> FlightWriter:
-    settings = ReplaySettings(config=FlyConfig(), wall_offset_ns=1)
-    return FlightWriter(folder, make_meta(**changes), settings=settings)
+    with without_writer_process():
+        settings = ReplaySettings(config=FlyConfig(), wall_offset_ns=1)
+        return FlightWriter(folder, make_meta(**changes), pressure="offline", settings=settings)
 
 
 @pytest.mark.parametrize("is_finished", [True, False])

@@ -45,7 +45,7 @@ def link(pipe: TlogPipe) -> Iterator[PacketPipe]:
 @pytest.fixture
 def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWriter]:
     job = VideoJob(tmp_path / "camera.mp4", 30, tlog=pipe.reader)
-    made = VideoWriter(job)
+    made = VideoWriter(job, pressure="online")
     yield made
     made.close()
 
@@ -84,7 +84,7 @@ def test_the_log_goes_on_after_the_recording_was_finished(
 ) -> None:
     send(link, 10)
     for k in range(5):
-        video.append(picture(k), k)
+        video.submit(picture(k), k)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
         os.kill(video._process.pid, number)
     video.finish()

@@ -1,6 +1,7 @@
 import errno
 import os
 import signal
+import threading
 from contextlib import closing
 from multiprocessing import Pipe
 from pathlib import Path
@@ -17,6 +18,7 @@ from helpers.recordings import (
     number_of,
     picture,
     read_video,
+    send_signal,
 )
 from mavbridge.recording import video_process, video_writer
 from mavbridge.recording.video_process import (
@@ -29,7 +31,14 @@ from mavbridge.recording.video_process import (
     allocate,
     ring_of,
 )
-from mavbridge.recording.video_writer import VideoWriter
+from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterError
+
+DEADLINE_S = 30.0
+
+
+def writer(folder: Path, pressure: Pressure) -> closing[VideoWriter]:
+    job = VideoJob(folder / "camera.mp4", hz=30)
+    return closing(VideoWriter(job, pressure=pressure))
 
 
 def read_back(path: Path) -> list[int]:
@@ -39,9 +48,9 @@ def read_back(path: Path) -> list[int]:
 
 def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
     job = VideoJob(tmp_path / "odd.mp4", hz=10)
-    with closing(VideoWriter(job)) as video:
+    with closing(VideoWriter(job, pressure="offline")) as video:
         for k in range(3):
-            assert video.append(picture(k, height=49, width=67), k)
+            assert video.submit(picture(k, height=49, width=67), k)
         video.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["odd.mp4"]
     images = list(read_video(tmp_path / "odd.mp4"))
@@ -56,11 +65,35 @@ def test_a_pause_of_both_processes_is_no_hang(tmp_path: Path) -> None:
 
     with (
         patch.object(video_writer, "wait", paused_once),
-        closing(VideoWriter(VideoJob(tmp_path / "camera.mp4", hz=30))) as video,
+        writer(tmp_path, "offline") as video,
     ):
-        video.append(picture(0), 0)
+        video.submit(picture(0), 0)
         video.finish()
     assert read_back(tmp_path / "camera.mp4") == [0]
+
+
+def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
+    with writer(tmp_path, "offline") as video:
+        video.submit(picture(0), 0)
+        send_signal(video._process.pid, signal.SIGSTOP)
+        reasons: list[str] = []
+        has_begun = threading.Event()
+
+        def produce() -> None:
+            try:
+                for k in range(1, 100):
+                    video.submit(picture(k), k)
+                    has_begun.set()
+            except WriterError as error:
+                reasons.append(str(error))
+
+        producer = threading.Thread(target=produce)
+        producer.start()
+        assert has_begun.wait(DEADLINE_S)
+        send_signal(video._process.pid, signal.SIGKILL)
+        producer.join(DEADLINE_S)
+        assert len(reasons) == 1
+        assert "has died" in reasons[0]
 
 
 class Alive:
@@ -86,12 +119,12 @@ def test_the_video_has_the_frames_that_were_taken(steps: list[bool]) -> None:
         service = WriterService(its, job)
         service.send(Notice.READY)
         with patch.object(video_writer, "start_process", lambda *_: (ours, Alive())):
-            sender = VideoWriter(job)
+            sender = VideoWriter(job, pressure="online")
         taken: list[int] = []
         for number, is_offered in enumerate(steps):
             if not is_offered:
                 service.serve(0)
-            elif sender.append(picture(number), number):
+            elif sender.submit(picture(number), number):
                 taken.append(number)
         ours.send(Notice.FINISH)
         while service.is_open:
@@ -127,7 +160,7 @@ def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
 
 
 def test_a_fork_of_the_policy_does_not_keep_the_writer(tmp_path: Path) -> None:
-    video = VideoWriter(VideoJob(tmp_path / "camera.mp4", hz=30))
+    video = VideoWriter(VideoJob(tmp_path / "camera.mp4", hz=30), pressure="online")
     child = os.fork()
     if child == 0:
         signal.pause()

@@ -1,6 +1,8 @@
 """Demonstrations are flights: recorded, labelled, resumable, and the same for the same seed."""
 
+import multiprocessing
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -19,6 +21,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates, Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.folder import write_meta
+from mavbridge.recording.video_writer import WriterDiedError
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED, SHIPPED_RATES
@@ -148,11 +151,22 @@ def test_no_other_student_goes_on_where_no_files_tell_two_apart(
         demonstrate(wanted[1])
 
 
-def test_a_demonstration_that_is_interrupted_is_unfinished(tmp_path: Path) -> None:
+def kill_the_writer() -> bool:
+    for child in multiprocessing.active_children():
+        child.kill()
+    return False
+
+
+@pytest.mark.parametrize(
+    ("act", "error"), [(lambda: True, EpisodeInterruptedError), (kill_the_writer, WriterDiedError)]
+)
+def test_a_demonstration_that_is_interrupted_or_loses_its_images_is_unfinished(
+    tmp_path: Path, act: Callable[[], bool], error: type[Exception]
+) -> None:
     spec = DemonstrationSpec(folder=tmp_path / "000000", seed=30_000, config=config(tmp_path))
     steps = count()
-    with pytest.raises(EpisodeInterruptedError):
-        fly_demonstration(spec, lambda: next(steps) >= 2_000)  # 5 s of vehicle steps
+    with pytest.raises(error):
+        fly_demonstration(spec, lambda: next(steps) >= 2_000 and act())  # 5 s of vehicle steps
     assert not open_flight(spec.folder).meta.finished
 
 

@@ -33,6 +33,7 @@ def require_needed_decoded(
 
 @pytest.mark.parametrize("decider", OBSERVED)
 @pytest.mark.parametrize("exe_steps", [1, 5, 16])
+@pytest.mark.usefixtures("in_process_writer")
 def test_frames_are_those_of_a_plain_loop_that_decodes_everything_at_the_end(
     tmp_path: Path, decider: str, exe_steps: int
 ) -> None:
@@ -59,6 +60,7 @@ def test_without_a_video_only_observed_frames_are_decoded(tmp_path: Path, decide
     assert not (tmp_path / "a.mp4").exists()
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_more_iterations_only_add_to_a_rollout(tmp_path: Path) -> None:
     """A generator of its own for each iteration and stage: what follows changes nothing before."""
     short, long = tmp_path / "short.mp4", tmp_path / "long.mp4"
@@ -75,6 +77,7 @@ def test_stages_and_iterations_share_no_noise() -> None:
     assert all(0 <= seed < 2**63 for seed in seeds)
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_fewer_frames_are_the_first_of_each_segment(tmp_path: Path) -> None:
     run(tmp_path / "all.mp4", make_plan(exe_steps=4))
     run(tmp_path / "few.mp4", make_plan(exe_steps=4, frames=4))

@@ -152,6 +152,9 @@ def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
     np.testing.assert_allclose(actions[8:], 0.8, atol=1e-6)
 
 
+pytestmark = pytest.mark.usefixtures("in_process_writer")
+
+
 class RecordingDecider:
     """A decider with a queue of two that keeps what it has seen."""
 

@@ -1,0 +1,10 @@
+import pytest
+
+from helpers.recordings import InProcessWriter
+from mavbridge.commands.imagine import output
+
+
+@pytest.fixture
+def in_process_writer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No writer process; the decode thread is there."""
+    monkeypatch.setattr(output, "VideoWriter", InProcessWriter)
