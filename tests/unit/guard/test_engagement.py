@@ -247,14 +247,14 @@ def test_each_flight_and_how_it_ended_is_counted() -> None:
     stepped.run(0.2, armed=True)
     stepped.step("engage")
     assert stepped.engagement.outcome == fault._replace(flights=3, end=None)
-    stepped.step(mode="LOITER")
-    assert stepped.engagement.outcome == fault._replace(flights=3, end="takeover")
+    stepped.step("release")
+    assert stepped.engagement.outcome == fault._replace(flights=3, end="operator")
 
 
 @pytest.mark.parametrize(
     ("change", "end"),
     [
-        ({"act": "release"}, "operator"),
+        ({"mode": "LOITER"}, "takeover"),
         ({"stop": EndRequest(because(Code.COURSE_DONE), end="course")}, "course"),
         ({"stop": EndRequest(because(Code.SIGNAL))}, "signal"),
         ({"stop": DEATH}, "fault"),
@@ -367,6 +367,13 @@ def left_by_key() -> Stepped:
     return stepped
 
 
+def held_by_key() -> Stepped:
+    stepped = flying(NO_RECEIVER, then="hold", on_fault="land")
+    stepped.step("release")
+    stepped.run(0.2, mode="BRAKE")
+    return stepped
+
+
 def left_by_fault() -> Stepped:
     stepped = flying(IDLE_RECEIVER)
     stepped.step(**FAULT)
@@ -395,6 +402,7 @@ def asked() -> Stepped:
         (lambda: flying(NO_RECEIVER), asking("BRAKE", (0, 100, 200))),
         (flying, asking("", (), (0, 20, 40)) + releasing(100)),
         (left_by_key, asking("LAND", ())),
+        (held_by_key, asking("BRAKE", ())),
         (stood_still, asking("BRAKE", (100, 200))),
         (asked, []),
         (
