@@ -7,7 +7,7 @@ from sitl.ardupilot.control import STEP_S, AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import Sticks
-from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten
 from sitl.vehicle.rotation import Quat, Vec3, horizontal, length
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
@@ -102,16 +102,19 @@ class CopterControl:
     ) -> tuple[float, ...]:
         if mode.is_guided:
             turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position)
-            self.collective = boosted(self.thrust, body, self._params)
         else:
             waits = now_ns < self.sinks_from_ns
             climb_mps = 0.0 if waits else self._climb_mps(mode, sticks, body)
-            turn = self._lean(mode, sticks, body, climb_mps, has_position=has_position)
+            turn = self._lean(mode, sticks, body, has_position=has_position)
+            if mode.manual_throttle:
+                self.thrust = pilot.manual_thrust(sticks, self._params)
+            else:
+                self.thrust = self.guided.climb(body, climb_mps, "PILOT_ACCEL_Z")
+        is_boosted = not mode.manual_throttle
+        self.collective = boosted(self.thrust, body, self._params) if is_boosted else self.thrust
         return mix(self.collective, turn)
 
-    def _lean(
-        self, mode: Mode, sticks: Sticks, body: BodyState, climb_mps: float, *, has_position: bool
-    ) -> Vec3:
+    def _lean(self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool) -> Vec3:
         """Run one step of a leaning mode. Return the body angular acceleration [rad/s^2]."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
@@ -121,13 +124,6 @@ class CopterControl:
         elif mode.lands:
             roll, pitch = self._lean_home(mode, body)
         yaw_rate = pilot.yaw_rate_radps(sticks, self._params) if mode.piloted else 0.0
-        if mode is Mode.STABILIZE:
-            self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
-        else:
-            limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
-            accel = self._height.update(body, climb_mps, limit)
-            self.thrust = thrust_for(accel, 1.0, self._params["MOT_THST_HOVER"])
-            self.collective = boosted(self.thrust, body, self._params)
         return self._attitude.lean(body, roll, pitch, yaw_rate)
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:

@@ -135,7 +135,7 @@ class GuidedControl:
             yaw = to_euler(self._attitude.target[0])[2]
             level = from_euler(0.0, 0.0, yaw)
             turn = self._attitude.approach(body, level, (0.0, 0.0, 0.0))
-            return turn, self._hold_climb(body, 0.0)
+            return turn, self.climb(body, 0.0)
         attitude, rate = setpoint.ned_from_body_wxyz, setpoint.rate_body_radps
         if attitude is None:
             turn = self._attitude.turn(body, rate)
@@ -144,7 +144,7 @@ class GuidedControl:
             self._setpoint = setpoint._replace(ned_from_body_wxyz=integrate(attitude, rate, STEP_S))
         if self._has_thrust:
             return turn, self._thrust()
-        return turn, self._hold_climb(body, self._climb_mps())
+        return turn, self.climb(body, self._climb_mps())
 
     def _fly_velocity(
         self, body: BodyState, now_ns: int, *, has_position: bool
@@ -166,7 +166,7 @@ class GuidedControl:
         self._yaw += self._yaw_rate_radps * STEP_S
         attitude = from_euler(roll, pitch, self._yaw)
         turn = self._attitude.approach(body, attitude, (0.0, 0.0, self._yaw_rate_radps))
-        return turn, self._hold_climb(body, -down)
+        return turn, self.climb(body, -down)
 
     def _start(self, submode: Submode, body: BodyState) -> None:
         """Set the velocity to zero, and reset the controllers if the submode changes."""
@@ -191,8 +191,10 @@ class GuidedControl:
         limit = "WPNAV_SPEED_UP" if above_half > 0.0 else "WPNAV_SPEED_DN"
         return above_half * self._params[limit] / 100.0
 
-    def _hold_climb(self, body: BodyState, climb_mps: float) -> float:
-        limit_mps2 = max(MIN_CLIMB_ACCEL_MPS2, self._params["WPNAV_ACCEL_Z"] / 100.0)
+    def climb(self, body: BodyState, climb_mps: float, limit: str = "WPNAV_ACCEL_Z") -> float:
+        """Return the thrust (0..1, of a level vehicle) for a climb rate; ``limit`` names the
+        parameter that limits its change."""
+        limit_mps2 = max(MIN_CLIMB_ACCEL_MPS2, self._params[limit] / 100.0)
         accel_mps2 = self._height.update(body, climb_mps, limit_mps2)
         return thrust_for(accel_mps2, 1.0, self._params["MOT_THST_HOVER"])
 
