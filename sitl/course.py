@@ -14,6 +14,7 @@ import numpy as np
 
 from sitl import UsageError
 from sitl.vehicle.rotation import (
+    IDENTITY,
     Quat,
     Vec3,
     conjugate,
@@ -116,12 +117,12 @@ class Course:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AirborneStart:
-    """Initial state of a flight that begins in the air."""
+    """Initial state of a flight that begins in the air; by default a hover, facing north."""
 
     position_ned_m: Vec3
-    velocity_ned_mps: Vec3
-    ned_from_body_wxyz: Quat
-    next_gate: int  # index of the first gate to pass
+    velocity_ned_mps: Vec3 = (0.0, 0.0, 0.0)
+    ned_from_body_wxyz: Quat = IDENTITY
+    next_gate: int = 0  # index of the first gate to pass
 
 
 def make_course(seed: int, laps: int = 1) -> Course:

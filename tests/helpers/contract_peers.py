@@ -20,12 +20,7 @@ FORCE = 21196
 REBOOT_FORCE = 20190226
 VELOCITY_MASK = 0x5C7
 """All fields ignored but a velocity and a yaw rate."""
-ALOFT = AirborneStart(
-    position_ned_m=(0.0, 0.0, -8.0),
-    velocity_ned_mps=(0.0, 0.0, 0.0),
-    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-    next_gate=0,
-)
+ALOFT = AirborneStart(position_ned_m=(0.0, 0.0, -8.0))
 
 
 class MockPeer:

@@ -30,12 +30,7 @@ from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, VehicleConfig
 from sitl.vehicle.firmware import VelocitySetpoint
 from sitl.vehicle.rotation import Quat, cos_tilt
 
-ALOFT = AirborneStart(
-    position_ned_m=(0.0, 0.0, -10.0),
-    velocity_ned_mps=(0.0, 0.0, 0.0),
-    ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-    next_gate=0,
-)
+ALOFT = AirborneStart(position_ned_m=(0.0, 0.0, -10.0))
 SOLVE_NS = 3 * MS
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
 """Lean 15 degrees to the right, or fly 2 m/s to the right: far from neutral in every record."""

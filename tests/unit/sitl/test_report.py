@@ -65,14 +65,7 @@ def test_after_a_stall_a_stick_is_not_recorded_before_it_came():
 def test_a_vehicle_that_is_put_elsewhere_has_not_flown_there():
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
     far_ned_m = (30.0, 40.0, -5.0)
-    vehicle.launch(
-        AirborneStart(
-            position_ned_m=far_ned_m,
-            velocity_ned_mps=(0.0, 0.0, 0.0),
-            ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-            next_gate=0,
-        )
-    )
+    vehicle.launch(AirborneStart(position_ned_m=far_ned_m))
     vehicle.step(NS_PER_S // 10)
     assert vehicle.ap.truth.position_ned_m == pytest.approx(far_ned_m, abs=0.5)
     vehicle.reboot()

@@ -4,7 +4,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.course import BAR_M, DEPTH_M, VEHICLE_RADIUS_M, AirborneStart, Course, Gate, struck_gate
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
-from sitl.vehicle.rotation import IDENTITY
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)
@@ -43,14 +42,8 @@ def test_a_struck_frame_is_a_crash_told_once_and_ends_the_count(firmware, speed_
     """PX4's airframe has more drag."""
     config = VehicleConfig(autopilot=firmware, estimator_ready_s=0.0, position_ready_s=0.0)
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
-    vehicle.launch(
-        AirborneStart(
-            position_ned_m=(7.0, 1.1, -2.0),
-            velocity_ned_mps=(6.0, 0.0, 0.0),
-            ned_from_body_wxyz=IDENTITY,
-            next_gate=0,
-        )
-    )
+    start = AirborneStart(position_ned_m=(7.0, 1.1, -2.0), velocity_ned_mps=(6.0, 0.0, 0.0))
+    vehicle.launch(start)
     for _ in range(100):
         heartbeat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3)
         vehicle.receive(0, heartbeat.pack(mav.MAVLink(None, srcSystem=255)), vehicle.ap.now_ns)

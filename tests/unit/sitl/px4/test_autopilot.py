@@ -12,10 +12,7 @@ from sitl.vehicle.rotation import from_euler
 
 MID = (0, 0, 500, 0)
 START = AirborneStart(
-    position_ned_m=(0.0, 0.0, -10.0),
-    velocity_ned_mps=(0.0, 0.0, 0.0),
-    ned_from_body_wxyz=from_euler(0.0, 0.0, 0.5),
-    next_gate=0,
+    position_ned_m=(0.0, 0.0, -10.0), ned_from_body_wxyz=from_euler(0.0, 0.0, 0.5)
 )
 
 

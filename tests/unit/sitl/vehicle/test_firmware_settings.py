@@ -12,14 +12,9 @@ from sitl.course import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import STEP_NS, VehicleConfig
-from sitl.vehicle.rotation import IDENTITY, to_euler
+from sitl.vehicle.rotation import to_euler
 
-ALOFT = AirborneStart(
-    position_ned_m=(0.0, 0.0, -30.0),
-    velocity_ned_mps=(0.0, 0.0, 0.0),
-    ned_from_body_wxyz=IDENTITY,
-    next_gate=0,
-)
+ALOFT = AirborneStart(position_ned_m=(0.0, 0.0, -30.0))
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 
 
