@@ -1,14 +1,11 @@
 """Torch policies as a user might write them, small and untrained."""
 
 import itertools
-import queue
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -130,20 +127,8 @@ class CountingInClass(TwoRates):
         return super().predict_fast(feature, state, history, steps)
 
 
-class CountingBelow(TwoRates):
-    """Its memory is an object in a list or deque, and an iterator."""
-
-    def __init__(self, phases: Any) -> None:
-        super().__init__()
-        self.phases, self.clock = phases, itertools.count()
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        self.phases[0].calls = next(self.clock)
-        return super().predict_fast(feature, state, history, steps)
-
-
 @dataclass(slots=True)
-class Phase:
+class Slotted:
     calls: int = 0
 
 
@@ -159,15 +144,22 @@ class CountingBy(TwoRates):
         return super().predict_fast(feature, state, history, steps)
 
 
-COUNTED, MODULE = Phase(), ModuleType("counted")
+COUNTED, MODULE = Slotted(), ModuleType("counted")
 
 
 def count_in_global() -> None:
     COUNTED.calls += 1
 
 
-def count_in_module() -> None:
-    vars(MODULE)["calls"] = vars(MODULE).get("calls", 0) + 1
+def counter_in(held: Any) -> Callable[[], None]:
+    """Return a function whose memory is an attribute of what its closure holds."""
+    is_collection = isinstance(held, list | deque)
+
+    def count() -> None:
+        holder: Any = held[0] if is_collection else held
+        holder.calls = getattr(holder, "calls", 0) + 1
+
+    return count
 
 
 def warn_in_module() -> None:
@@ -179,18 +171,8 @@ def count_in_default(calls: list[int] = [0]) -> None:  # noqa: B006 - a usual pl
     calls[0] += 1
 
 
-def count_in_attribute() -> None:
-    vars(count_in_attribute)["calls"] = vars(count_in_attribute).get("calls", 0) + 1
-
-
-def counter_in_closure() -> Callable[[], None]:
-    calls = 0
-
-    def count() -> None:
-        nonlocal calls
-        calls += 1
-
-    return count
+def tick(clock: Iterator[int] = itertools.count()) -> None:  # noqa: B008 - another usual place
+    next(clock)
 
 
 @lru_cache(maxsize=0)
@@ -239,34 +221,6 @@ class Scripted(TwoRates):
     def __init__(self) -> None:
         super().__init__()
         self.visual_encoder = torch.jit.script(self.visual_encoder)
-
-
-class OnSchedule(TwoRates):
-    """Turns half a minute after its start."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.turns = datetime.now(UTC) + timedelta(seconds=30)
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return -chunk if datetime.now(UTC) > self.turns else chunk
-
-
-class ReadingFile(TwoRates):
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return chunk if Path(__file__).read_text() else -chunk
-
-
-class ReadingQueue(TwoRates):
-    def __init__(self) -> None:
-        super().__init__()
-        self.news: queue.SimpleQueue[float] = queue.SimpleQueue()
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        chunk = super().predict_fast(feature, state, history, steps)
-        return chunk if self.news.empty() else chunk * self.news.get()
 
 
 class Listening(TwoRates):

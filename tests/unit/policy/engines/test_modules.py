@@ -6,8 +6,10 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +19,16 @@ import torch
 from torch import Tensor, nn
 
 from helpers import torch_policies
-from helpers.torch_policies import Counter, Scripted, TwoRates, changed
+from helpers.torch_policies import (
+    Counter,
+    CountingBy,
+    Scripted,
+    Slotted,
+    TwoRates,
+    changed,
+    counter_in,
+    scripted,
+)
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
 from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
@@ -43,6 +54,7 @@ def read_where_written(chunk: Tensor, state: Tensor) -> Tensor:
     return chunk * (100 - height[0].item())
 
 
+NEVER, SOURCE, NEWS = datetime.max.replace(tzinfo=UTC), Path(__file__), SimpleQueue[float]()
 DECIDING = [
     (TwoRates, lambda chunk, state: chunk if state[0, 2] < 100 else -chunk),
     (TwoRates, lambda chunk, state: chunk * min(state[0, 2], torch.tensor(100.0))),
@@ -56,21 +68,23 @@ NO_GRAPHS = [
     *((partial(changed, *each), "it decides by the values of a tensor") for each in DECIDING),
     (torch_policies.Counting, "it keeps calls from call to call"),
     (torch_policies.CountingInClass, "it keeps calls from call to call"),
-    *(
-        (partial(torch_policies.CountingBelow, phases), "it keeps calls, clock from call to call")
-        for phases in ([SimpleNamespace(calls=0)], deque([torch_policies.Phase()]))
-    ),
-    (torch_policies.OnSchedule, "it calls now, which a graph cannot"),
-    (torch_policies.ReadingFile, "it calls .*open.*read"),
-    (torch_policies.ReadingQueue, "it calls empty, which a graph cannot"),
+    (partial(CountingBy, torch_policies.tick), "it keeps clock from call to call"),
     (torch_policies.Resetting, "the policy has reset"),
-    (
-        partial(changed, TwoRates, lambda chunk, _: chunk + 0.1 * torch.randn_like(chunk)),
-        "warning: engine torch: the same inputs do not give the same chunk again",
-    ),
-    (
-        partial(changed, TwoRates, lambda chunk, _: sum([1e-9] * 100, chunk)),
-        "its graph has 1.. operations, and at most 90",
+    *(
+        (partial(changed, TwoRates, change), reason)
+        for change, reason in (
+            (
+                lambda chunk, _: chunk if datetime.now(UTC) < NEVER else -chunk,
+                "it calls now, which",
+            ),
+            (lambda chunk, _: chunk if SOURCE.read_text() else -chunk, "it calls .*open.*read"),
+            (lambda chunk, _: chunk if NEWS.empty() else -chunk, "it calls empty, which a graph"),
+            (
+                lambda chunk, _: chunk + 0.1 * torch.randn_like(chunk),
+                "warning: engine torch: the same inputs do not give the same chunk again",
+            ),
+            (lambda chunk, _: sum([1e-9] * 100, chunk), "its graph has 1.. operations, and at mo"),
+        )
     ),
 ]
 
@@ -90,18 +104,18 @@ def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(make, reason,
 @pytest.mark.parametrize(
     "count",
     [
-        *(torch_policies.count_in_global, torch_policies.count_in_default),
-        torch_policies.count_in_module,
-        *(torch_policies.count_in_attribute, torch_policies.counter_in_closure()),
-        *(
-            Counter().count,
-            torch_policies.count_in_cached,
-            partial(Counter.count, Counter()),
+        torch_policies.count_in_global,
+        torch_policies.count_in_default,
+        torch_policies.count_in_cached,
+        *map(
+            counter_in, (torch_policies.MODULE, scripted, [SimpleNamespace()], deque([Slotted()]))
         ),
+        Counter().count,
+        partial(Counter.count, Counter()),
     ],
 )
 def test_a_memory_behind_functions_is_found(count: Callable[[], object]) -> None:
-    runner, notes = choose_runner(torch_policies.CountingBy(count), "auto", SETTINGS)
+    runner, notes = choose_runner(CountingBy(count), "auto", SETTINGS)
     assert runner.engine == "torch"
     assert notes == ("engine torch: it keeps calls from call to call, which a graph cannot",)
 
@@ -119,7 +133,7 @@ def test_what_a_thread_of_the_policy_tells_it_is_flown() -> None:
 
 
 def test_what_python_keeps_in_a_module_is_no_memory() -> None:
-    policy = torch_policies.CountingBy(torch_policies.warn_in_module)
+    policy = CountingBy(torch_policies.warn_in_module)
     assert choose_runner(policy, "auto", SETTINGS)[0].engine.startswith("openvino")
 
 
