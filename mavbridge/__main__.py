@@ -1,5 +1,6 @@
 """Entry point: expected errors are one message and their status; anything else is our bug."""
 
+import errno
 import importlib.util
 import io
 import os
@@ -28,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.stderr.write(f"error: {problem}\n")
         sys.exit(2)  # ExitCode.REFUSED, which cannot be imported yet
     # Only now: these import the packages that may be hidden.
-    from mavbridge.core.errors import MavbridgeError
+    from mavbridge.core.errors import MavbridgeError, UserError
     from mavbridge.core.provenance import without_secrets
     from mavbridge.core.stopping import end_process, interrupt_once
 
@@ -47,11 +48,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
         status = cli.meta(with_home(list(sys.argv[1:] if arguments is None else arguments)))
     except KeyboardInterrupt:
         end(128 + signal.SIGINT)
-    except MavbridgeError as error:
+    except (MavbridgeError, OSError) as raised:
+        error = raised if isinstance(raised, MavbridgeError) else UserError(_forbidden(raised))
         message = f"[bold red]error:[/] {escape(without_secrets(str(error)))}"
         console = SafeConsole(stderr=True, highlight=False, emoji=False)
         end(error.exit_code, partial(console.print, message, soft_wrap=True))
     end(status or 0)
+
+
+def _forbidden(error: OSError) -> str:
+    """Return a message about a path that this user may not use; raise any other error again.
+
+    Any look at a path may fail so, if only ``Path.exists``.
+    """
+    if error.errno not in (errno.EACCES, errno.ENAMETOOLONG) or error.filename is None:
+        raise error
+    return (
+        f"{error.filename}: {error.strerror}; name another path, or let this user "
+        f"(id {os.geteuid()}) reach it"
+    )
 
 
 def open_closed_streams() -> None:

@@ -110,8 +110,10 @@ def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
 
     ``kind`` is the expected format.
     """
-    if isinstance(error, OSError) and error.strerror and not path.is_file():
-        return f"{path}: {error.strerror.lower()}"
+    try:
+        open_regular(path).close()  # safetensors calls a forbidden file missing
+    except OSError as failure:
+        return f"{path}: {str(failure.strerror).lower()}"
     if (found := stand_in(path)) is not None:
         what, advice = found
         return f"{path} is {what}: {advice}"

@@ -92,9 +92,15 @@ def _is_device(spec: str) -> bool:
 
 
 def _file_mode(spec: str) -> int:
-    """Return the kind of a file, as ``os.stat`` has it; 0 if there is none of this name."""
+    """Return the kind of a file, as ``os.stat`` has it; 0 if there is none of this name.
+
+    Raises:
+        PermissionError: it is in a forbidden folder.
+    """
     try:
         return Path(spec).stat().st_mode
+    except PermissionError:
+        raise
     except (OSError, ValueError):
         return 0
 

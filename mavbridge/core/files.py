@@ -18,16 +18,17 @@ _T = TypeVar("_T")
 def require_writable(path: Path | None, flag: str) -> None:
     """Raise UserError if the file that a flag names cannot be written; create its folder.
 
-    ``flag``, such as ``--json``, is named in the message. No empty file is left behind.
+    ``flag``, such as ``--json``, is named in the message. No empty file is left behind, and a link
+    stays. Never blocks; opening a pipe without a reader would.
     """
     if path is None:
         return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         existed = path.exists()
-        path.open("ab").close()
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o666))
         if not existed:
-            path.unlink()
+            Path(os.path.realpath(path)).unlink()
     except OSError as error:
         raise UserError(
             f"cannot write {flag} {path}: {error.strerror}; name a file in a folder that you may "
@@ -42,7 +43,7 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
     A start that failed leaves nothing behind.
     """
     wanted = {each for folder in folders if folder for each in (folder, *folder.parents)}
-    missing = [folder for folder in wanted if not folder.exists()]
+    missing = [folder for folder in wanted if not os.path.exists(folder)]  # noqa: PTH110 - never raises
     try:
         yield
     finally:

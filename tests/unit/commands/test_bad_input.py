@@ -26,6 +26,8 @@ FLY = "--connect udp:127.0.0.1:1"
 BLIND = "--policy scripted --camera none"
 RECORD = "record --out recorded"
 LISTEN = f"{RECORD} --connect udp:127.0.0.1:14999"
+LONG = "n" * 300
+"""A name that no file system takes. A folder that is forbidden to the user fails alike."""
 TRAIN = "train spots --out a.safetensors"
 TRAIN_WORLD = "train-world-model spots --out a.safetensors"
 
@@ -65,6 +67,13 @@ BAD = [
         for flag in ("--dual-rate", "--no-dual-rate", "--single-rate")
     ),
     ("--connect udp:127.0.0.1:1 --log-file /proc/x/y", "cannot write --log-file /proc/x/y"),
+    *(
+        (f"{words}{LONG}/x.safetensors", "File name too long")
+        for words in (
+            *(f"{FLY} {BLIND} --record ", f"{FLY} --checkpoint ", f"{FLY} --policy onnx:"),
+            *("contract ", "demonstrate --out ", "export-policy --out ", f"{TRAIN} --start-from "),
+        )
+    ),
     ("check --connect none --policy none --soak 60", "--soak needs a policy"),
     ("contract empty", "neither a LeRobot policy"),
     ("contract broken.onnx", "broken.onnx cannot be read as ONNX"),

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.core.files import write_durably, write_output
+from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable, write_durably, write_output
 
 
 @pytest.mark.parametrize("fault", [errno.EINVAL, errno.EIO])
@@ -39,3 +40,13 @@ def test_a_folder_that_was_removed_is_not_made_again(tmp_path: Path) -> None:
     assert not (tmp_path / "flight").exists()
     write_output(tmp_path / "new" / "out.json", "{}", "--out")
     assert (tmp_path / "new" / "out.json").read_text() == "{}"
+
+
+def test_the_check_of_an_output_leaves_links_and_waits_for_no_reader(tmp_path: Path) -> None:
+    link, pipe = tmp_path / "latest.json", tmp_path / "pipe"
+    link.symlink_to("flight.json")
+    require_writable(link, "--json")
+    os.mkfifo(pipe)
+    with pytest.raises(UserError, match=r"cannot write --json .*pipe"):
+        require_writable(pipe, "--json")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["latest.json", "pipe"]

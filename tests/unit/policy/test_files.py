@@ -1,3 +1,4 @@
+import errno
 import os
 import re
 from pathlib import Path
@@ -8,7 +9,7 @@ from mavbridge.__main__ import main
 from mavbridge.config.settings_files import with_home
 from policy.adapters.interface import read_interface
 from policy.errors import ContractError
-from policy.files import MAX_TOML_BYTES, open_regular, parse_json, read_toml
+from policy.files import MAX_TOML_BYTES, open_regular, parse_json, read_toml, why_unreadable
 
 
 def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
@@ -16,6 +17,15 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
     for path in (tmp_path / "pipe.toml", Path("/dev/null"), tmp_path):
         with pytest.raises(OSError, match="not a file"):
             open_regular(path)
+
+
+def test_a_forbidden_file_is_neither_damaged_nor_missing(tmp_path, monkeypatch) -> None:
+    def forbid(path: Path) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr("policy.files.open_regular", forbid)
+    said = why_unreadable(tmp_path / "a", FileNotFoundError(errno.ENOENT, "No such file"))
+    assert said == f"{tmp_path / 'a'}: permission denied"
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,", f"{10**400}", "\n"])
