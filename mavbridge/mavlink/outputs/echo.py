@@ -20,6 +20,8 @@ after about 14 ms; 200 ms of delay each way and a few lost packets still leave h
 MATCH_NS = 700 * NS_PER_MS
 """Maximum age of a command that may still be echoed: 200 ms of delay each way, a value held through
 five lost packets at 30 Hz, one interval of the echo message, and a margin."""
+MOST_COMMANDS = 2048
+"""Five seconds at 400 Hz: longer than a vehicle holds sticks that it no longer hears."""
 SILENT_US = 400_000
 """Longest time that the echo may be constant, by the vehicle's clock. The command changes every 25
 ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
@@ -74,8 +76,8 @@ class EchoCheck:
 
     def __init__(self, rules: EchoRules) -> None:
         self._rules = rules
-        self._sent: deque[tuple[int, Shown]] = deque()
-        """Commands of the last 0.7 s; after a release, of the 0.7 s before it."""
+        self._sent: deque[tuple[int, Shown]] = deque(maxlen=MOST_COMMANDS)
+        """Commands since 0.7 s before the last echo message; after a release, until that."""
         self._since_ns: int | None = None
         """First command of this check; None while released."""
         self._tried_ns = 0
@@ -84,6 +86,8 @@ class EchoCheck:
         """Last values shown before ours."""
         self._matched_ns: int | None = None
         """Arrival of the last echo; None: not confirmed."""
+        self._held_ours: Shown | None = None
+        """Shown value that is ours, as long as it is shown: a deaf vehicle holds it for seconds."""
         self._order = StampOrder()
         self._arrived_ns: int | None = None
         """Arrival of the last echo message."""
@@ -128,7 +132,7 @@ class EchoCheck:
         """Note a command, sent or not: its echo is expected from now on."""
         self._tried_ns = now_ns
         if self._since_ns is None:
-            self._since_ns = now_ns
+            self._since_ns, self._held_ours = now_ns, None
             self._sent.clear()
 
     def sent(self, values: Shown, now_ns: int) -> None:
@@ -140,8 +144,6 @@ class EchoCheck:
             if now_ns - self._sent[-1][0] > MATCH_NS:
                 self._restart(now_ns)
         self._sent.append((now_ns, values))
-        while self._sent[0][0] < now_ns - MATCH_NS:
-            self._sent.popleft()
 
     def released(self) -> None:
         """Note the end of sending; the next command starts a new check."""
@@ -165,7 +167,9 @@ class EchoCheck:
         if self._since_ns is None:
             self._baseline = values
             apart = self._rules.release_tolerance
-            self.is_released |= not any(_is_within(apart, values, past) for _, past in self._sent)
+            is_ours = any(_is_within(apart, values, past) for _, past in self._sent)
+            self._held_ours = values if is_ours or values == self._held_ours else None
+            self.is_released |= self._held_ours is None
             self.shows_last = bool(self._sent) and self._is_near(values, self._sent[-1][1])
         elif self._is_paused(now_ns):
             self._note_pause(values, now_ns)
@@ -174,8 +178,15 @@ class EchoCheck:
 
     def _judge(self, values: Shown, shown_us: int, now_ns: int) -> None:
         """Compare the shown values while we send."""
+        is_held = values == self._held_ours
+        while self._sent[0][0] < now_ns - MATCH_NS:
+            is_held |= self._is_near(values, self._sent.popleft()[1])
         is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))
-        if not self.confirmed:
+        is_held &= not is_ours
+        self._held_ours = values if is_ours or is_held else None
+        if is_held:
+            pass
+        elif not self.confirmed:
             self._seek(values, is_ours, now_ns)
         elif is_ours:
             self._matched_ns = now_ns
@@ -184,7 +195,7 @@ class EchoCheck:
                 self._fail("foreign", now_ns)
         elif _is_often(self._returned_us, shown_us):
             self._fail("returned", now_ns)
-        if self.confirmed:
+        if self.confirmed or is_held:
             self._watch_change(values, shown_us, now_ns)
 
     def _forget_shown(self) -> None:

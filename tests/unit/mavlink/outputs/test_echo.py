@@ -258,6 +258,23 @@ def test_a_pause_of_our_own_says_nothing_about_the_vehicle(pause_s: float, keeps
         assert world.seconds_to_fault()[0] == "silent"
 
 
+@pytest.mark.parametrize(("pause_s", "gap_s"), [(0.35, 0.0), (0.6, 0.0), (0.0, 0.65), (0.3, 0.5)])
+def test_sticks_of_ours_that_a_deaf_vehicle_holds_are_never_another_sources(
+    pause_s: float, gap_s: float
+) -> None:
+    """Taken for a takeover, they would be left to the vehicle until its own timeout."""
+    world = engaged(sticks=moving)
+    world.is_deaf, world.is_sending = True, False
+    assert world.run(pause_s) is None
+    world.is_sending, world.loss = True, 1.0
+    world.run(gap_s)
+    world.loss = 0.0
+    assert world.seconds_to_fault()[0] == "silent"
+    world.release()
+    world.run(0.2)
+    assert not world.echo.is_released
+
+
 # --- the first echo
 
 
