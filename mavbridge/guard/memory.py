@@ -151,11 +151,8 @@ class Memory:
     def fly(self, now: EngagementInputs, _cause: object) -> None:
         """the policy's actions, starting from the pilot's or idle sticks"""
         self.outcome = self.outcome._replace(flights=self.outcome.flights + 1, end=None)
-        self.reason, self.own_mode, self.seen_interruptions = (
-            None,
-            now.status.mode,
-            now.link.interruptions,
-        )
+        self.reason, self.own_mode = None, now.status.mode
+        self.seen_interruptions = now.link.interruptions
         self.engaged_ns = now.now_ns if self.engaged_ns is None else self.engaged_ns
 
     def leave(self, now: EngagementInputs, cause: EndRequest) -> None:

@@ -126,9 +126,8 @@ class EngageSequence:
         is_ready = now.status.armed and wanted is None and climb_m is None and objection is None
         self.waits_for = None if is_ready else objection or self._lack(now, wanted, climb_m)
         is_heard = now.status.armed or now.link.echo_confirmed
-        if self.waits_for is None or objection is not None or not is_heard:
-            return Actions(control=control)
-        if now.now_ns < self.request_due_ns:
+        is_due = is_heard and now.now_ns >= self.request_due_ns
+        if self.waits_for is None or objection is not None or not is_due:
             return Actions(control=control)
         if control is ControlSource.NEUTRAL and (self.settings.is_setpoint or self.lends_sticks):
             if self.flows_from_ns is None:
@@ -334,7 +333,9 @@ class DisengageSequence:
         # PX4's safe modes give way to a stick that is not in the middle when its receiver follows.
         is_kept = self.mode is not None and is_confirmed and not now.link.modes.override
         is_safe = self.may_release or is_kept
-        self.must_hold = not self.settings.is_setpoint and (self.is_silence_failsafe or not is_safe)
+        self.must_hold = self.is_silence_failsafe or not is_safe
+        if self.settings.is_setpoint:  # silence leaves ArduPilot in our mode, to nobody
+            self.must_hold = not (is_confirmed or now.link.modes.needs_setpoints_first)
         if unheard_ns is not None:  # the timeout starts when the vehicle is heard
             self.asks_until_ns = now.now_ns + MODE_TIMEOUT_NS
         # A refusal before our request is an earlier flight's. No vehicle refuses to land: such an
@@ -352,8 +353,7 @@ class DisengageSequence:
         self.is_done = is_over and not is_undone
         # In thrust modes neutral would climb or fall, so the mode change comes first. Even after
         # it, the vehicle may take our jump to neutral for a hand.
-        is_entered = bool(self.mode) and is_confirmed and not now.link.modes.override
-        is_level_only = self.is_thrust_mode and not is_entered
+        is_level_only = self.is_thrust_mode and not is_kept
         control: ControlSource | None
         control = ControlSource.LEVEL if is_level_only else ControlSource.NEUTRAL
         if self.settings.is_setpoint and now.status.is_landed:

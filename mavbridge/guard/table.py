@@ -265,8 +265,8 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
 def may_release(m: Memory, _: EngagementInputs) -> bool:
     """it may be released
 
-    A pilot or receiver would hold the vehicle and silence is no failsafe; or the actions are
-    setpoints.
+    Sticks: a hand or safe mode holds it, silence is no failsafe. Setpoints: the safe mode is
+    confirmed, or PX4.
     """
     return not m.disengage.must_hold
 

@@ -306,6 +306,20 @@ def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_ne
         assert found.final_mode == hold(flight)
 
 
+@pytest.mark.parametrize(("kind", "up_s", "down_s"), [("sticks", 2.5, 1.2), ("rates", 4.0, 0.0)])
+def test_a_vehicle_that_holds_our_last_command_without_hearing_us_is_never_left_to_it(
+    kind: ActionKind, up_s: float, down_s: float
+) -> None:
+    """It leaned on for 3 s, until RC_OVERRIDE_TIME, or drifted for ever in GUIDED_NOGPS."""
+    flight = OutputFlight("ardupilot", kind, on_fault="hold").fly(1.2)
+    at_s = flight.t_s
+    silence(flight, up_s=up_s, down_s=down_s)
+    flight.run(up_s + 1.2)
+    found = flight.aftermath(at_s)
+    assert found.final_mode == "BRAKE", flight.describe()
+    assert found.lean_held_ms < 1000 * up_s + 160, found
+
+
 @pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
 def test_a_failsafe_of_the_vehicle_is_left_alone(
     autopilot: AutopilotName, kind: ActionKind
