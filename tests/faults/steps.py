@@ -167,7 +167,7 @@ def joystick(stage: Stage, *, hz: float, s: float) -> int:
 def param(stage: Stage, *, name: str, value: float) -> int:
     """Set a parameter of the vehicle from another station."""
     config = VehicleConfig(autopilot="px4" if stage.is_px4 else "ardupilot")
-    kind = SimulatedVehicle(links=0, boot_ns=0, config=config).params.kind(name)
+    kind = SimulatedVehicle(links=0, boot_ns=0, config=config).params.on_wire(name)[1]
     if kind == dialect.MAV_PARAM_TYPE_INT32:
         (value,) = struct.unpack("<f", struct.pack("<i", int(value)))
     message = dialect.MAVLink_param_set_message(*VEHICLE, name.encode(), value, kind)
