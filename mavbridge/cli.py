@@ -33,6 +33,7 @@ from mavbridge.config.settings_files import (
     with_settings,
 )
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import require_writable
 from mavbridge.core.log import run_log
 from mavbridge.core.provenance import printable
 from mavbridge.core.realtime import require_supported_system
@@ -227,11 +228,9 @@ def _prepare_training(
     for path in flights:
         if not path.is_dir():
             raise UserError(f"{path}: no such folder")
-    folder = settings.out.parent
-    if not folder.is_dir():
-        raise UserError(f"--out {settings.out}: there is no folder {folder}")
-    if not os.access(folder, os.W_OK):
-        raise UserError(f"--out {settings.out}: {folder} cannot be written to")
+    if not settings.out.parent.is_dir():
+        raise UserError(f"--out {settings.out}: there is no folder {settings.out.parent}")
+    require_writable(settings.out, "--out")
     if settings.start_from is not None and not settings.start_from.is_file():
         raise UserError(f"--start-from {settings.start_from}: no such file")
     # torch's threads else spin at every barrier: on a core that something else uses too, ten times

@@ -92,11 +92,7 @@ def _is_device(spec: str) -> bool:
 
 
 def _file_mode(spec: str) -> int:
-    """Return the kind of a file, as ``os.stat`` has it; 0 if there is none of this name.
-
-    Raises:
-        PermissionError: it is in a forbidden folder.
-    """
+    """Return the kind of a file, as ``os.stat`` has it; 0 if there is none of this name."""
     try:
         return Path(spec).stat().st_mode
     except PermissionError:

@@ -158,6 +158,7 @@ BAD = [
     (f"{TRAIN} --minutes nan", "--minutes"),
     (f"{TRAIN} --steps 1 --minutes 1", "contradict"),
     (f"{TRAIN} --start-from b.safetensors", "no such file"),
+    ("train spots --out folder.safetensors --steps 1", "folder.safetensors: Is a directory"),
     (f"{TRAIN} --camera-key front", "these flights have one"),
     ("train two --out a.safetensors", "several cameras ['down', 'front']: name one by"),
     ("train two --out a.safetensors --camera-key up", "no camera up; it has ['down'"),
@@ -193,6 +194,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_meta(folder / "foreign", format="something else")
     (folder / "empty").mkdir()
     (folder / "left.unfinished").mkdir()
+    (folder / "folder.safetensors").mkdir()
     for name, text in (
         ("act/config.json", b"{}"),
         ("foreign-words/meta/info.json", b"{}"),
