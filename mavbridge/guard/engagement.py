@@ -249,8 +249,7 @@ class Engagement(Memory):
         link = replace(now.link, status=status, are_sticks_at_rest=False)
         now = replace(now, link=link, heard_ns=None)
         rests = bool(now.link.modes.override) and not self.settings.is_setpoint
-        rest_ns = STICK_REST_NS if rests else 0
-        until_ns = rest_ns + _ASKED_NS
+        until_ns = _ASKED_NS + (STICK_REST_NS if rests else 0)
         for after_ns in (after_ms * NS_PER_MS for after_ms in _REHEARSED_MS):
             if after_ns > until_ns:
                 break

@@ -346,7 +346,7 @@ class GuardLoop:
                     absence = None
                 case Reason() as absence:
                     pass
-                case FlightSettings() as settings if self.guard is None:
+                case FlightSettings() as settings if self.guard is None:  # once
                     self.guard = Guard(settings, self._clock.now_ns())
                     self._link.begin_flight(
                         settings.meaning,
@@ -357,8 +357,6 @@ class GuardLoop:
                     self.stop(ending)
                 case "engage" | "release" as new:
                     act = "release" if act == "release" else new  # release wins over a later engage
-                case _:
-                    pass  # settings are taken only once
         if self._flight.is_closed:
             self.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), end="fault"))
         return GuardInput(

@@ -203,7 +203,7 @@ class DisengageSequence:
     """Requested safe mode; a change to it is no takeover."""
     is_done: bool = False
     must_hold: bool = False
-    """True if neutral must go on: silence is a failsafe, or the receiver would drop it."""
+    """True if neutral must go on: silence is a failsafe, or nobody would hold the vehicle."""
     is_silence_failsafe: bool = False
     """True if the end of our sticks triggers the vehicle's failsafe."""
     may_release: bool = False
@@ -299,9 +299,8 @@ class DisengageSequence:
         return told_ns is not None and self.asked_ns is not None and told_ns >= self.asked_ns
 
     def _watch_undoing(self, now: EngagementInputs) -> None:
-        if self.mode is None or self.asked_ns is None:
-            return
-        if not now.link.echo_confirmed or now.link.overruled is not None:
+        is_shown = now.link.echo_confirmed and now.link.overruled is None
+        if self.mode is None or self.asked_ns is None or not is_shown:
             return
         if now.status.mode == now.link.modes.override:
             self.undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
@@ -353,9 +352,8 @@ class DisengageSequence:
         self.is_done = is_over and not is_undone
         # In thrust modes neutral would climb or fall, so the mode change comes first. Even after
         # it, the vehicle may take our jump to neutral for a hand.
-        is_level_only = self.is_thrust_mode and not is_kept
-        control: ControlSource | None
-        control = ControlSource.LEVEL if is_level_only else ControlSource.NEUTRAL
+        is_level = self.is_thrust_mode and not is_kept
+        control: ControlSource | None = ControlSource.LEVEL if is_level else ControlSource.NEUTRAL
         if self.settings.is_setpoint and now.status.is_landed:
             control = ControlSource.IDLE  # hover thrust would lift it
         may_pull_back = self.settings.is_setpoint and now.link.modes.needs_setpoints_first
