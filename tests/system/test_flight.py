@@ -129,7 +129,7 @@ def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     assert not back.meta.finished
     assert back.ticks.num_rows > 0
     assert_rows_match_frames(back)
-    assert (folder / "frames.parquet").exists()
+    assert (folder / "frames.arrows").exists(), "as those of all other rows"
     logged = list(logged_overrides(folder / "link.tlog"))
     assert len(logged) > 0
     assert logged == flying.relay.overrides
