@@ -1,7 +1,6 @@
 """Page of ``mavbridge inspect --html``: one file with the figures, the plots and the video."""
 
 import html
-import json
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -20,7 +19,7 @@ from mavbridge.commands.inspect.analysis import (
     flight_findings,
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.files import write_output
+from mavbridge.core.files import as_json, write_output
 from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.terminal import BAD, POOR
@@ -53,9 +52,7 @@ def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
 
 def page_data(flights: Sequence[FlightAnalysis]) -> str:
     """Return the JSON in the page. It contains no ``<``, so that no name can end its element."""
-    return json.dumps([_flight(flight) for flight in flights], allow_nan=False).replace(
-        "<", "\\u003c"
-    )
+    return as_json([_flight(flight) for flight in flights]).replace("<", "\\u003c")
 
 
 def _flight(flight: FlightAnalysis) -> dict[str, Any]:
@@ -68,7 +65,7 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
         "t": _packed(t_s),
         "plots": [plot for plot in _plots(flight) if plot["series"]],
         "holders": [asdict(span) | {"reason": str(span.reason or "")} for span in flight.holders],
-        "moments": [asdict(moment) for moment in flight.moments],
+        "moments": flight.moments,
         "track": _track(flight),
         "gates": [gate._asdict() for gate in flight.gates],
         "video": _video(flight),
