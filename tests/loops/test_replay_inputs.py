@@ -18,7 +18,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FeatureFrame, Solve, Tick, TickSink, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
 from mavbridge.flight.action_frames import ActionFrame
-from mavbridge.flight.policy_loop import PolicyLoop, chunk_of
+from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.values import Phase
 from mavbridge.mavlink.link import MavlinkLink
@@ -136,7 +136,6 @@ def flown_and_repeated(
 
     parts = {
         "vision_loops": recorded,
-        "PolicyLoop": partial(PolicyLoop, watches=[flown.solves.append]),
         "TelemetryCache": partial(TelemetryCache, watch_packets=flown.packets.extend),
     }
     for name, part in parts.items():
@@ -145,6 +144,7 @@ def flown_and_repeated(
     settings = SimulationSettings(config=FlyConfig(goal=goal), least_camera_px=32)
     vehicle = make_vehicle(autopilot=autopilot)
     one = SimulatedFlight(course_seed=3, seed=1, settings=settings, vehicle=vehicle)
+    one.solve_watchers.append(flown.solves.append)
     runner = make()
     one.fly(runner, max_time_s=FLIGHT_S, sinks=(flown.sink,))
     source = flown.source(runner, goal)
