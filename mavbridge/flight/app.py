@@ -205,7 +205,8 @@ class _Flight:
         """Reason for which the guard was asked to end. Until it is asked, it ends without a summary
         only if it dies."""
         self._observers = FlightObservers(plan, runner, clock=clock, console=console)
-        stack.callback(self._close_recorder)  # after the guard: it records the release
+        # After the guard: it records the release.
+        stack.callback(self._observers.close_recorder, guard, lambda: self.outcome)
         cameras = open_cameras(
             plan.config.camera,
             plan.contract,
@@ -241,9 +242,6 @@ class _Flight:
             watches=[each.emit for each in recorders],
         )
         self._watchdog = _Watchdog(plan, clock, self._policy, self._visions)
-
-    def _close_recorder(self) -> None:
-        self._observers.close_recorder(self._guard.summary, self.outcome)
 
     @property
     def outcome(self) -> FlightOutcome | None:

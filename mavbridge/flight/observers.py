@@ -174,13 +174,16 @@ class FlightObservers:
             raise UserError(f"--record {self._config.record}: {error}") from error
         self._recorder = recorder
 
-    def close_recorder(self, summary: GuardSummary | None, outcome: FlightOutcome | None) -> None:
+    def close_recorder(
+        self, guard: GuardProcess, outcome_of: Callable[[], FlightOutcome | None]
+    ) -> None:
         """Finish the recording. Call after the guard has ended, so that it has the release."""
         recorder = self._recorder
         if recorder is None or self._config.record is None:
             return
+        outcome = outcome_of()
         meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
-        params = {} if summary is None else summary.params
+        params = {} if guard.summary is None else guard.summary.params
         recorder.meta = replace(meta, parameters=params)
         self._write_end(recorder.meta, self._config.record)  # in case that it takes too long
         recorder.close(RECORDER_JOIN_S)
