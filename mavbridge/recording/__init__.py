@@ -1,8 +1,8 @@
 """Recorded flights on disk, in the format of docs/formats.md.
 
-    vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks
+    vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> tables
                                                                          |
-                                      VideoWriter: frames through shared memory, rows by pipe
+                                      VideoWriter: frames through shared memory
                                                                          v
                                             writer process --> camera.mp4
     process of the link --open_tlog_pipe--> writer process --> link.tlog

@@ -236,7 +236,7 @@ class FlightWriter:
     def finish(self, meta: FlightMeta) -> None:
         """Close everything in order, and complete ``meta`` with the counts kept here.
 
-        If a writer has died, its table stays as it was and ``finished`` stays false.
+        If a writer has died, its video stays as it was and ``finished`` stays false.
         """
         try:
             self.flush()

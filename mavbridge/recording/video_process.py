@@ -15,7 +15,6 @@ import os
 import signal
 import socket
 import tempfile
-import threading
 from contextlib import suppress
 from enum import Enum, auto
 from multiprocessing.connection import Connection
@@ -24,6 +23,7 @@ from typing import Any, NamedTuple, Never, TypeAlias
 
 import numpy as np
 
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.folder import TLOG
 from mavbridge.recording.tlog import TlogFile
@@ -202,12 +202,14 @@ class WriterService:
 
     def finish_log(self) -> None:
         """Copy the log to its end, for ``TLOG_S`` at most; after an error, leave it."""
+        clock = MonotonicClock()
+        until_ns = clock.now_ns() + round(TLOG_S * NS_PER_S)
         with suppress(OSError):
-            for _ in range(round(TLOG_S / PERIOD_S)):
-                if self._tlog is None or self._tlog.has_ended:
+            while self._tlog is not None and not self._tlog.has_ended:
+                if (now_ns := clock.now_ns()) > until_ns:
                     return
                 self._tlog.copy()
-                threading.Event().wait(PERIOD_S)
+                clock.sleep_until_ns(now_ns + round(PERIOD_S * NS_PER_S))
 
     def _receive(self) -> ToWriter:
         """Return the next message, or ``FINISH`` if the producer is gone; open the ring."""
