@@ -11,12 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mavbridge.camera.capture import open_device, open_stream, present_devices
+from mavbridge.camera.capture import VideoFileCamera, open_device, open_stream, present_devices
 from mavbridge.camera.grabber import Grabber, ImageSource, wait_until_due
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.pipe import PipeSource, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
-from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError

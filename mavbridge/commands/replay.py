@@ -29,7 +29,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
 from mavbridge.core.vehicle import ACTION_CLASSES
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, is_stateless, load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of

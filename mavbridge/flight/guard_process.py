@@ -18,8 +18,7 @@ from mavbridge.core.ticks import GuardTick
 from mavbridge.flight.settings import link_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
-from mavbridge.guard.settings import GuardSettings
-from mavbridge.guard.values import Phase
+from mavbridge.guard.values import GuardSettings, Phase
 from mavbridge.guard.wire import (
     NO_WORDS,
     FromGuard,

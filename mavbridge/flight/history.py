@@ -1,4 +1,9 @@
-"""The history of sent actions at given times."""
+"""Actions between the axes of the policy's contract and those of the guard, and their history.
+
+The guard, its limits and MAVLink use NED world and FRD body axes. A policy with ``state_frame =
+"enu_flu"`` (ROS, REP 103) outputs actions, and reads its action history, in ENU and FLU. The
+conversion is its own inverse.
+"""
 
 import threading
 from bisect import bisect_right
@@ -9,15 +14,53 @@ import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FloatArray
-from mavbridge.core.vehicle import Action
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.core.vehicle import ACTION_CLASSES, Action
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.limits import ActionSmoother
-from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import FlightSettings
 from policy.contract import Contract, history_ages_ns
 
 REPORTED_NS = 10 * NS_PER_MS
 """Age of a sent action from which the guard has reported it, in flight as in a replay."""
+
+
+class ActionFrame:
+    """Kind and axes of a policy's actions; converts them to NED and FRD, and back."""
+
+    def __init__(self, contract: Contract) -> None:
+        thrust = contract.hover_thrust if contract.action in ("rates", "attitude") else 0.0
+        self.neutral: Action = ACTION_CLASSES[contract.action](thrust, 0.0, 0.0, 0.0)
+        """Zeros, or zeros with hover thrust. Equal in both frames."""
+        self._axes = _other_axes(contract)
+
+    def to_guard(self, actions: FloatArray) -> tuple[Action, ...]:
+        """Convert policy actions [horizon, 4] to NED and FRD actions."""
+        kind = type(self.neutral)
+        return tuple(map(kind._make, self._converted(actions).tolist()))
+
+    def from_guard(self, actions: Sequence[Action]) -> FloatArray:
+        """Convert sent actions of the policy's kind to its frame, [len, 4]."""
+        return self._converted(np.array(actions, dtype=np.float32))
+
+    def _converted(self, actions: FloatArray) -> FloatArray:
+        if self._axes is None:
+            return actions
+        order, signs = self._axes
+        return actions[:, order] * np.array(signs, dtype=np.float32)
+
+
+def _other_axes(contract: Contract) -> tuple[tuple[int, ...], tuple[float, ...]] | None:
+    """Return order and signs of the conversion: component ``i`` in one frame is ``signs[i]`` times
+    component ``order[i]`` in the other. None: the frames are the same."""
+    kind = contract.action
+    if contract.state_frame == "ned_frd" or kind == "sticks":
+        return None
+    if kind == "velocity" and contract.velocity_frame == "world":
+        # East, north, up, left turn <-> north, east, down, right turn.
+        return (1, 0, 2, 3), (1.0, 1.0, -1.0, -1.0)
+    if kind == "velocity":  # forward, left, up <-> forward, right, down
+        return (0, 1, 2, 3), (1.0, -1.0, -1.0, -1.0)
+    return (0, 1, 2, 3), (1.0, 1.0, -1.0, -1.0)
 
 
 class SentHistory:

@@ -23,8 +23,8 @@ from mavbridge.core.provenance import (
 )
 from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.guard_process import GuardProcess
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.outcome import FlightReferee, describe
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files

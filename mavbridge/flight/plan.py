@@ -17,7 +17,7 @@ from mavbridge.flight.settings import (
 )
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.limits import Smoothing
-from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import FlightSettings
 from policy.contract import Contract
 
 

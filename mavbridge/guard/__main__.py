@@ -18,8 +18,7 @@ from mavbridge.core.realtime import settle_guard
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.loop import GuardLoop
-from mavbridge.guard.settings import GuardSettings
-from mavbridge.guard.values import EndRequest, Outcome
+from mavbridge.guard.values import EndRequest, GuardSettings, Outcome
 from mavbridge.guard.wire import (
     GuardDiedError,
     GuardSummary,

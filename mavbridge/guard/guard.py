@@ -23,13 +23,13 @@ from mavbridge.guard.chunks import Chunk, ChunkBuffer, late
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import Envelope
 from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
-from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.table import switch_unseen
 from mavbridge.guard.values import (
     Actions,
     ControlSource,
     EndRequest,
     EngagementInputs,
+    FlightSettings,
     OperatorCommand,
     Phase,
     StickGrid,

@@ -24,8 +24,7 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.channel import Port, SocketPort
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
-from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
+from mavbridge.guard.values import EndRequest, FlightSettings, OperatorCommand, Phase
 from mavbridge.guard.wire import (
     NO_WORDS,
     GuardStatus,

@@ -28,8 +28,14 @@ from mavbridge.core.vehicle import (
     Telemetry,
 )
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.settings import FlightSettings, GuardSettings
-from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
+from mavbridge.guard.values import (
+    EndRequest,
+    FlightSettings,
+    GuardSettings,
+    OperatorCommand,
+    Outcome,
+    Phase,
+)
 
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _ACTION = struct.Struct("<4d")

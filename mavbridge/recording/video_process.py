@@ -1,4 +1,4 @@
-"""Process that encodes frames into a video, and keeps the log of the link.
+"""Process that encodes frames into a video, and keeps the log of the link; the video file.
 
 It ends by itself with all files closed, even if its producer is killed: the pipe then ends. The log
 has a separate pipe from another process, and the end of that pipe is awaited last. The producer
@@ -17,17 +17,20 @@ import socket
 import tempfile
 from contextlib import suppress
 from enum import Enum, auto
+from fractions import Fraction
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, Never, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, Never, TypeAlias
 
+import av
 import numpy as np
+from av.container import OutputContainer
+from av.error import FFmpegError
 
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.folder import TLOG
 from mavbridge.recording.tlog import TlogFile
-from mavbridge.recording.video_file import WRITE_ERRORS, FragmentedMp4
 
 MAX_SLOTS = 32
 MIN_SLOTS = 4
@@ -228,3 +231,79 @@ class WriterService:
         self.is_open = False
         reason = getattr(error, "strerror", None) or error
         self.send(Failed(f"the {what} cannot be written: {self._folder}: {reason}"))
+
+
+CRF = "20"
+"""Constant quality. 17 to 18 counts as visually lossless; 23 is x264's default."""
+GOP_FRAMES = 30
+"""One second between key frames."""
+TIME_BASE = Fraction(1, 90_000)
+"""Usual time base of video; the exact stamps are in the table."""
+_OPTIONS: dict[str, object] = {
+    "preset": "veryfast",
+    "tune": "zerolatency",  # a frame in, a packet out
+    "crf": CRF,
+    "threads": "1",
+    "g": str(GOP_FRAMES),
+}
+_DEPTH = "gray16le"
+_FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
+WRITE_ERRORS = (OSError, FFmpegError)
+_BUFFER_BYTES = 1 << 20
+"""Larger than a fragment, which is therefore written in one call that a kill cannot tear."""
+
+
+class FragmentedMp4:
+    """Video file that grows frame by frame. Methods can raise ``WRITE_ERRORS``."""
+
+    def __init__(self, path: Path, hz: float) -> None:
+        """Write to ``path``, created with the first frame, which gives the size and the kind.
+
+        ``hz`` is the nominal frame rate; the stamps of the frames decide.
+        """
+        self._path, self._hz = path, hz
+        self._file: BinaryIO | None = None
+        self._first_ns: int | None = None
+        self._last_pts = -1
+
+    def _open(self, image: CameraImage) -> BinaryIO:
+        self._file = file = self._path.open("xb", buffering=_BUFFER_BYTES)
+        self._container: OutputContainer = av.open(file, "w", format="mp4", options=_FRAGMENTED)
+        rate = Fraction(self._hz).limit_denominator(1000)
+        if image.ndim == 2:  # depth
+            self._stream = self._container.add_stream("ffv1", rate)
+            self._stream.options = {"g": "1"}  # each image separately
+        else:
+            self._stream = self._container.add_stream("libx264", rate)
+            self._stream.options = _OPTIONS
+        self._stream.height, self._stream.width = image.shape[:2]
+        self._stream.pix_fmt = _DEPTH if image.ndim == 2 else "yuv420p"
+        self._stream.codec_context.time_base = TIME_BASE
+        return file
+
+    def append(self, image: CameraImage, captured_ns: int) -> None:
+        """Encode one frame with even sides and hand it to the kernel.
+
+        A stamp not later than the last frame's is moved behind it.
+        """
+        file = self._file or self._open(image)
+        if self._first_ns is None:
+            self._first_ns = captured_ns
+        pts = max(self._last_pts + 1, (captured_ns - self._first_ns) * 9 // 100_000)
+        pixels: Any = image
+        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24" if image.ndim == 3 else _DEPTH)
+        frame.pts, frame.time_base = pts, TIME_BASE
+        self._container.mux(self._stream.encode(frame))
+        file.flush()
+        self._last_pts = pts
+
+    def close(self) -> None:
+        """Write the remaining data and close the file, also after an error. Can be called twice."""
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            self._container.mux(self._stream.encode(None))
+            self._container.close()
+        finally:
+            file.close()

@@ -23,8 +23,14 @@ from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
 from mavbridge.simulation.delays import Delays, Stalls
-from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process, sender
-from mavbridge.simulation.network import DelayedChannel, MemoryTransport
+from mavbridge.simulation.network import (
+    DelayedChannel,
+    GuardStepper,
+    MemoryPort,
+    MemoryTransport,
+    flight_process,
+    sender,
+)
 from mavbridge.simulation.referee import RUN_OUT_S, EpisodeResult, Referee
 from mavbridge.simulation.world import (
     MOUNTS,

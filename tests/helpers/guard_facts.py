@@ -20,12 +20,12 @@ from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import ActionLimits, Smoothing
-from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import (
     Actions,
     EndRequest,
     EngagementInputs,
     EngagementSettings,
+    FlightSettings,
     OperatorCommand,
     Phase,
 )

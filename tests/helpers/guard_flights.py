@@ -30,8 +30,7 @@ from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock
-from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process
-from mavbridge.simulation.network import DelayedChannel
+from mavbridge.simulation.network import DelayedChannel, GuardStepper, MemoryPort, flight_process
 from policy.protocol import PolicyRunner
 from sitl.vehicle.config import VehicleConfig
 

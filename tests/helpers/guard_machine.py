@@ -24,8 +24,7 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import Smoothing
-from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
+from mavbridge.guard.values import EndRequest, FlightSettings, OperatorCommand, Phase
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
 

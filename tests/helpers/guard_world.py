@@ -11,8 +11,7 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.guard.wire import FromGuard, decode_from_guard
 from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
 from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.guard import MemoryPort
-from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
+from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryPort, MemoryTransport
 from mavbridge.simulation.world import VehicleStepper
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import VehicleConfig

@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
-from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
+from mavbridge.mavlink.session.vehicle_params import VehicleParams
 
 STEP_NS = 10 * NS_PER_MS
 

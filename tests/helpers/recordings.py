@@ -18,8 +18,7 @@ from mavbridge.recording import flight_writer
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.video_file import FragmentedMp4
-from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording.video_process import FragmentedMp4, VideoJob
 from policy.contract import Contract
 from policy.data.flight_video import decode_images, video_parts
 

@@ -19,7 +19,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.simulation.clock import SteppedClock

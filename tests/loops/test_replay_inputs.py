@@ -17,7 +17,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FeatureFrame, Solve, Tick, TickSink, VisionTick
 from mavbridge.core.vehicle import ActionKind, ForwardedPacket
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.values import Phase

@@ -13,7 +13,7 @@ from faults.record import aftermath
 from faults.stage import faulty_policy, staged
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight.guard_process import GuardProcess
-from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import GuardSettings
 from sitl.clock import Clock
 
 pytestmark = pytest.mark.system

@@ -10,8 +10,8 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.profiles.profile import ParamNote, Profile
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from mavbridge.mavlink.session.params.vehicle_params import Assessment
 from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.mavlink.session.vehicle_params import Assessment
 from policy.contract import Contract
 
 _STICK_OUTPUTS = ("rc-override", "manual-control")

@@ -29,8 +29,7 @@ from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video_file import WRITE_ERRORS
-from mavbridge.recording.video_process import VideoJob
+from mavbridge.recording.video_process import WRITE_ERRORS, VideoJob
 from mavbridge.recording.video_writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
 

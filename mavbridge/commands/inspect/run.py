@@ -22,7 +22,7 @@ from mavbridge.commands.output import print_status, table_console, write_json
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import Observed, Tick, VisionTick
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.terminal import BAD, Finding, number, timing_table
 from mavbridge.observe.viewer import RerunView

@@ -22,7 +22,7 @@ from mavbridge.mavlink.codec.messages import (
     SystemStatus,
 )
 from mavbridge.mavlink.profiles.profile import Profile
-from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
+from mavbridge.mavlink.session.vehicle_params import VehicleParams
 
 _T = TypeVar("_T")
 SETTLE_NS = 100 * NS_PER_MS

@@ -4,13 +4,7 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.address import (
-    LinkAddress,
-    SerialAddress,
-    TcpAddress,
-    UdpAddress,
-    spelled,
-)
+from mavbridge.core.address import LinkAddress, SerialAddress, TcpAddress, UdpAddress, spelled
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Code, Reason, because

@@ -38,8 +38,8 @@ from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile, StreamGroup
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.condition import SETTLE_NS, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
-from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester
+from mavbridge.mavlink.session.vehicle_params import VehicleParams
 
 _PROFILES: dict[int, Profile] = {
     dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT,

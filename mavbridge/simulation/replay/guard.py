@@ -18,15 +18,14 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.ticks import GuardTick
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import chunk_of
 from mavbridge.flight.settings import link_settings
 from mavbridge.guard.chunks import GRACE_PERIODS, LEAST_GRACE_NS, MAX_REFUSED, Chunk
 from mavbridge.guard.guard import Guard, GuardInput
 from mavbridge.guard.loop import GuardLoop
-from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
+from mavbridge.guard.values import EndRequest, FlightSettings, OperatorCommand, Phase
 from mavbridge.guard.wire import ToGuard, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import (

@@ -13,7 +13,7 @@ from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, MavbridgeError, UserError
-from mavbridge.recording.video_file import FragmentedMp4
+from mavbridge.recording.video_process import FragmentedMp4
 from sitl.camera.shm import FramePublisher
 
 needs_shm = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")

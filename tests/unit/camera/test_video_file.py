@@ -4,7 +4,7 @@ import pytest
 
 from helpers.camera_senders import FakeCapture
 from helpers.fakes import START_NS
-from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.camera.capture import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import CameraError, PolicyError
 

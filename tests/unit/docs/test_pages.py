@@ -27,7 +27,7 @@ from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.profiles.ardupilot import ArduPilot
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.profiles.px4 import Px4
-from mavbridge.mavlink.session.params.vehicle_params import received_bytes_per_s
+from mavbridge.mavlink.session.vehicle_params import received_bytes_per_s
 from sitl.app import _parser as sitl_parser
 
 _GUIDES = ("simulators", "companion_computers", "real_vehicle", "record_and_train", "timing")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mavbridge.core.vehicle import Action, AttitudeThrust, BodyRates, Sticks, Velocity
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from policy.contract import ActionKind, Contract, VelocityFrame
 
 FOUR = np.array([[0.5, 1.0, 2.0, 3.0], [0.25, -4.0, 5.0, -6.0]], np.float32)

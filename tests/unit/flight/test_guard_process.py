@@ -30,8 +30,7 @@ from mavbridge.flight.guard_process import (
     start_guard,
 )
 from mavbridge.guard.channel import SocketPort
-from mavbridge.guard.settings import GuardSettings
-from mavbridge.guard.values import Phase
+from mavbridge.guard.values import GuardSettings, Phase
 from mavbridge.guard.wire import GuardDiedError, LastWords, encode_from_guard
 
 MS = NS_PER_MS

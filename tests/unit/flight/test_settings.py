@@ -19,8 +19,7 @@ from mavbridge.flight.settings import (
     state_folder,
 )
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EngagementSettings
+from mavbridge.guard.values import EngagementSettings, FlightSettings
 from policy.contract import Contract
 
 LINK = LinkConfig(connect="udp:127.0.0.1:14550")

@@ -14,8 +14,7 @@ from mavbridge.core.vehicle import IDLE, NEUTRAL, ForwardedPacket, LinkArrivals,
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
-from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.values import EndRequest, Phase
+from mavbridge.guard.values import EndRequest, FlightSettings, Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardStatus,

@@ -15,7 +15,7 @@ from mavbridge.core.vehicle import AdviceText, Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamWrite
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
-from mavbridge.mavlink.session.params.vehicle_params import serial_risks
+from mavbridge.mavlink.session.vehicle_params import serial_risks
 
 S = NS_PER_S
 SIGNED = SigningFiles(key_file=Path("key"), state_folder=Path("state"))

@@ -23,7 +23,7 @@ from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Observed, Position
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
-from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.history import ActionFrame
 from mavbridge.observe.viewer import EVENT_CHARACTERS, RerunView, layout
 from mavbridge.observe.viewer_layout import ViewedFlight, flight_blueprint, styles
 from policy.contract import Contract

@@ -8,7 +8,7 @@ import pytest
 from helpers.factories import FRAME_NS, START_NS
 from helpers.recordings import count_frames, number_of, picture, read_video
 from mavbridge.core.records import CameraImage
-from mavbridge.recording.video_file import FragmentedMp4
+from mavbridge.recording.video_process import FragmentedMp4
 from policy.data.flight_data import DatasetError
 from policy.data.flight_video import decode_images, decode_video, video_parts
 

@@ -22,7 +22,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight import guard_process
 from mavbridge.flight.plan import plan_flight
-from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import GuardSettings
 from mavbridge.guard.wire import GuardStatus
 
 

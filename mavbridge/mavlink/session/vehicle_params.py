@@ -22,7 +22,7 @@ from mavbridge.mavlink.codec.messages import (
 )
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
-from mavbridge.mavlink.session.params.temporary import TemporaryParams
+from mavbridge.mavlink.session.temporary_params import TemporaryParams
 
 _FRAME_BYTES = 12
 """Header and checksum of MAVLink 2."""
