@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,67 +36,62 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Sides = tuple[float, float]
 """Value for the positive side, value for the negative side."""
-Motion = Literal["lean", "rate", "speed"]
-"""Of the vehicle: + is right, forward, nose right, up."""
-UNITS: dict[Motion, tuple[str, str]] = {
-    "lean": ("deg", "attitude_ns"),
-    "rate": ("deg/s", "rate_ns"),
-    "speed": ("m/s", "velocity_ns"),
-}
-"""Unit of each motion, and the field of a state with its measurement time."""
-_DEG = math.degrees(1.0)
+_DEG, _NONE = math.degrees(1.0), 1e-9
+"""One radian; a motion that counts as none."""
 MAX_ROWS = 100_000
 """Most ticks kept: four minutes at 400 Hz. The oldest are dropped first."""
-STEP_S, MOST_DEAD, LEAD = 0.01, 60, 110
-"""Grid of the fit; longest dead time, and span of actions before the first motion, in its steps."""
-LAGS_S = np.geomspace(0.01, 1.5, 73)
-STRIDE = 2
-"""Stride of the first search; a second one looks at the neighbours of its result."""
-OUTLIER_MADS, LEAST_R_SQUARED = 6.0, 0.7
-STEADY, RESTED = 0.1, np.array([0.01, 0.1])
-"""Most change at the end of a push, in shares of the value: of a steady action, and of a motion at
-rest, in the first and in the second push. The first tells a limited rate from a slow lag."""
-EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
-"""Time by which a push ends early because of the smoothing's lag; time used before a push, and at
-the end of a pause; longest gap in sends of a flying policy; time to climb before the doublet."""
+STEP_S, LEAD = 0.01, 60
+"""Grid of the fit; longest dead time, in its steps, for which actions before a push are used."""
+LAGS_S = np.geomspace(0.01, 1.5, 40)
+EARLY_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 1.0, 0.25, 20.0
+"""Time by which a push ends early because of the smoothing's lag; time used at the end of a pause;
+longest gap in sends of a flying policy; time to climb before the doublet."""
+STEADY, LEAST_EXPLAINED = 0.1, 0.5
+"""Most change of a steady action, as a share of it; least share of a motion to be explained."""
 
 
 class Channel(NamedTuple):
-    """One axis: a number of the action, and the resulting motion."""
+    """One axis: a number of the action, and the resulting motion in a 13-D state."""
 
     axis: Axis
     column: int
     scale: float
     """Factor from the number of the action to the motion's unit, or to shares of full stick."""
-    motion: Motion
+    motion: str
+    """With its unit; + is right, forward, nose right, up."""
+    stamp: str
+    """Field of a ``VehicleState`` with the time of the motion."""
+    read: Callable[[FloatArray], float]
 
 
-READ: dict[tuple[Axis, Motion], Callable[[FloatArray], float]] = {
-    ("roll", "lean"): lambda state: _DEG * measure(state).roll_rad,
-    ("pitch", "lean"): lambda state: -_DEG * measure(state).pitch_rad,
-    ("roll", "rate"): lambda state: _DEG * float(state[RATE][0]),
-    ("pitch", "rate"): lambda state: -_DEG * float(state[RATE][1]),
-    ("yaw", "rate"): lambda state: _DEG * float(state[RATE][2]),
-    ("roll", "speed"): lambda state: measure(state).right_mps,
-    ("pitch", "speed"): lambda state: measure(state).forward_mps,
-    ("climb", "speed"): lambda state: measure(state).climb_mps,
-}
-"""Motion about or along an axis in a 13-D state."""
-_YAW = Channel("yaw", 3, _DEG, "rate")
+_LEAN, _RATE = ("lean, deg", "attitude_ns"), ("rate, deg/s", "rate_ns")
+_SPEED = ("speed, m/s", "velocity_ns")
+_ROLL = (*_LEAN, lambda state: _DEG * measure(state).roll_rad)
+_PITCH = (*_LEAN, lambda state: -_DEG * measure(state).pitch_rad)
+_YAW = (*_RATE, lambda state: _DEG * measure(state).yaw_rate_radps)
+_CLIMB = (*_SPEED, lambda state: measure(state).climb_mps)
 CHANNELS: dict[ActionKind, tuple[Channel, ...]] = {
     "sticks": (
-        Channel("roll", 3, 1.0, "lean"),
-        Channel("pitch", 2, 1.0, "lean"),
-        Channel("yaw", 1, 1.0, "rate"),
-        Channel("climb", 0, 1.0, "speed"),
+        Channel("roll", 3, 1.0, *_ROLL),
+        Channel("pitch", 2, 1.0, *_PITCH),
+        Channel("yaw", 1, 1.0, *_YAW),
+        Channel("climb", 0, 1.0, *_CLIMB),
     ),
-    "attitude": (Channel("roll", 1, _DEG, "lean"), Channel("pitch", 2, -_DEG, "lean"), _YAW),
-    "rates": (Channel("roll", 1, _DEG, "rate"), Channel("pitch", 2, -_DEG, "rate"), _YAW),
+    "attitude": (
+        Channel("roll", 1, _DEG, *_ROLL),
+        Channel("pitch", 2, -_DEG, *_PITCH),
+        Channel("yaw", 3, _DEG, *_YAW),
+    ),
+    "rates": (
+        Channel("roll", 1, _DEG, *_RATE, lambda state: _DEG * float(state[RATE][0])),
+        Channel("pitch", 2, -_DEG, *_RATE, lambda state: -_DEG * float(state[RATE][1])),
+        Channel("yaw", 3, _DEG, *_YAW),
+    ),
     "velocity": (
-        Channel("roll", 1, 1.0, "speed"),
-        Channel("pitch", 0, 1.0, "speed"),
-        _YAW,
-        Channel("climb", 2, -1.0, "speed"),
+        Channel("roll", 1, 1.0, *_SPEED, lambda state: measure(state).right_mps),
+        Channel("pitch", 0, 1.0, *_SPEED, lambda state: measure(state).forward_mps),
+        Channel("yaw", 3, _DEG, *_YAW),
+        Channel("climb", 2, -1.0, *_CLIMB),
     ),
 }
 """Axes pushed by the doublet of each kind of action."""
@@ -106,57 +101,44 @@ class ResponseRecording:
     """``TickSink`` that keeps the policy's actions and the states that they are based on."""
 
     def __init__(self) -> None:
-        self._sent: deque[tuple[int, Action]] = deque(maxlen=MAX_ROWS)
-        self._states: deque[VehicleState] = deque(maxlen=MAX_ROWS)
+        self._rows: deque[tuple[int, Action, VehicleState]] = deque(maxlen=MAX_ROWS)
 
     def emit(self, event: Event) -> None:
         """Keep a tick in which the policy flew; see ``mavbridge.core.records.TickSink``."""
-        if not isinstance(event, Tick) or event.trace is None:
-            return
-        # The policy's action after its limits, before any mapping to this vehicle's curves.
-        self._sent.append((event.sent_ns, event.trace.smoothed))
-        state = event.state
-        if state is not None and (not self._states or state is not self._states[-1]):
-            self._states.append(state)
+        if isinstance(event, Tick) and event.trace is not None and event.state is not None:
+            # The policy's action after its limits, before any mapping to this vehicle's curves.
+            self._rows.append((event.sent_ns, event.trace.smoothed, event.state))
 
-    def inputs(self, column: int, scale: float = 1.0) -> tuple[Array, Array]:
+    def inputs(self, column: int) -> tuple[Array, Array]:
         """Return times in s and values of one number of the actions."""
-        times = np.array([at_ns for at_ns, _ in self._sent], np.float64) / NS_PER_S
-        return times, scale * np.array([action[column] for _, action in self._sent], np.float64)
+        times = np.array([at_ns for at_ns, _, _ in self._rows], np.float64) / NS_PER_S
+        return times, np.array([action[column] for _, action, _ in self._rows], np.float64)
 
     def outputs(self, channel: Channel) -> tuple[Array, Array]:
         """Return times in s and values of a motion, without repeated times."""
-        read, stamp = READ[channel.axis, channel.motion], UNITS[channel.motion][1]
-        times = np.array([getattr(state, stamp) for state in self._states], np.int64)
-        values = np.array([read(state.values) for state in self._states], np.float64)
-        _, first = np.unique(times, return_index=True)
-        return times[first].astype(np.float64) / NS_PER_S, values[first]
+        states = {getattr(state, channel.stamp): state.values for _, _, state in self._rows}
+        values = [channel.read(states[at_ns]) for at_ns in sorted(states)]
+        return np.array(sorted(states), np.float64) / NS_PER_S, np.array(values)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushResult:
-    """One axis pushed at one amplitude to both sides."""
+    """One axis pushed to both sides."""
 
     axis: Axis
-    motion: Motion
-    unit: str
+    motion: str
+    """With its unit."""
     action: Sides
     """In shares of full stick, or in the unit of the motion."""
     measured: Sides
     """Settled motion of the vehicle."""
     trained: Sides
     """Motion expected by the policy's training."""
+    ratio: Sides
+    """Measured over trained."""
     dead_time_s: float
     time_63_s: float
     """Time from a step of the action to 63 % of its effect."""
-    r_squared: float
-    """Share of the motion's variance that dead time, lag and gains explain."""
-
-    @property
-    def ratio(self) -> tuple[float | None, float | None]:
-        """Measured over trained; None if no motion was expected."""
-        up, down = (m / t if t else None for m, t in zip(self.measured, self.trained, strict=True))
-        return up, down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,69 +156,59 @@ def identify_pushes(
 ) -> Identification:
     """Fit every push of the flown doublet, which began at ``program_start_s`` on the clock of the
     stamps; ``contract`` is of the policy to compare with."""
-    pushes: list[PushResult] = []
-    missing: list[str] = []
-    channels = {channel.axis: channel for channel in CHANNELS[contract.action]}
-    steps = doublet_steps(contract.action)
-    for step in steps:
-        found = _fit_push(recording, channels[step.axis], step, contract, program_start_s)
-        if isinstance(found, PushResult):
-            pushes.append(found)
-        else:
-            missing.append(f"{step.axis} at {step.share:.0%}: {found}")
+    steps = doublet_steps(contract.action, program_start_s)
+    found = {
+        step.axis: _fit_push(recording, channel, step, contract)
+        for step, channel in zip(steps, CHANNELS[contract.action], strict=True)
+    }
     hover = None
     if contract.action in ("rates", "attitude"):
-        input_s, thrust = recording.inputs(0)
-        ends_s = [program_start_s + step.end_s + step.settle_s for step in steps]
-        still = [(input_s >= end_s - STILL_S) & (input_s < end_s) for end_s in ends_s]
+        at_s, thrust = recording.inputs(0)
+        ends_s = [step.end_s + step.settle_s for step in steps]
+        still = [(at_s >= end_s - STILL_S) & (at_s < end_s) for end_s in ends_s]
         rested = thrust[np.any(still, axis=0)]
         hover = float(np.median(rested)) if len(rested) else None
-    return Identification(pushes=tuple(pushes), missing=tuple(missing), policy_hover_thrust=hover)
+    return Identification(
+        pushes=tuple(push for push in found.values() if isinstance(push, PushResult)),
+        missing=tuple(f"{axis}: {why}" for axis, why in found.items() if isinstance(why, str)),
+        policy_hover_thrust=hover,
+    )
 
 
 def _fit_push(
-    recording: ResponseRecording,
-    channel: Channel,
-    step: DoubletStep,
-    contract: Contract,
-    program_start_s: float,
+    recording: ResponseRecording, channel: Channel, step: DoubletStep, contract: Contract
 ) -> PushResult | str:
-    """Return the result of one push, or the reason why there is none."""
-    begin_s, end_s = program_start_s + step.begin_s, program_start_s + step.end_s
-    input_s, inputs = recording.inputs(channel.column, channel.scale)
-    within = (input_s >= begin_s) & (input_s <= end_s)
-    if np.diff(np.concatenate([[begin_s], input_s[within], [end_s]])).max() > LONGEST_GAP_S:
+    """Return the result of one push, or the reason why there is none; ``step`` is on the clock of
+    the stamps."""
+    input_s, inputs = recording.inputs(channel.column)
+    flown_s = input_s[(input_s >= step.begin_s) & (input_s <= step.end_s)]
+    if np.diff(np.concatenate([[step.begin_s], flown_s, [step.end_s]])).max() > LONGEST_GAP_S:
         return "the policy did not fly all of it"
-    pushing = inputs[within & (input_s < end_s - EARLY_S)]  # feedback may return before the end
-    up, down = float(pushing.max(initial=0.0)), float(pushing.min(initial=0.0))
+    grid_s = np.arange(step.begin_s - LEAD * STEP_S, step.end_s - EARLY_S, STEP_S)
+    at_s, latest = grid_s[LEAD:], np.searchsorted(input_s, grid_s, side="right") - 1
+    held = channel.scale * inputs[np.maximum(latest, 0)]
+    moved = np.interp(at_s, *recording.outputs(channel))
+    action = float(held[LEAD:].max()), float(held[LEAD:].min())
+    up, down = (_trained_motion(contract, channel, amount) for amount in action)
     if up <= 0.0 or down >= 0.0:
         return "it was not pushed to both sides"
-    grid_s = np.arange(begin_s - BEFORE_S - LEAD * STEP_S, end_s - EARLY_S, STEP_S)
-    held = inputs[np.clip(np.searchsorted(input_s, grid_s, side="right") - 1, 0, None)]
-    at_s, pushed = grid_s[LEAD:], held[LEAD:]
-    moved = np.interp(at_s, *recording.outputs(channel))
-    ends_s = (begin_s + step.half_s - EARLY_S, end_s - EARLY_S)
-    late = [(at_s >= last_s - step.half_s / 4) & (at_s < last_s) for last_s in ends_s]
-    is_steady = all(np.ptp(pushed[each]) <= STEADY * abs(pushed[each].mean()) for each in late)
-    settled = late[0] | late[1] if is_steady else np.full(len(at_s), True)
-    known = _rested_gains(pushed, moved, late) if is_steady else None
-    if known is not None:  # the first push began at rest, and shows dead time and lag
-        count = int(np.searchsorted(at_s, ends_s[0]))
-        held, moved, settled = held[: LEAD + count], moved[:count], settled[:count]
-    fit = _fit_response(held, moved, settled, known) if np.ptp(moved) > 0.0 else None
-    if fit is None or fit.r_squared < LEAST_R_SQUARED:
+    left_s = (step.end_s - EARLY_S - at_s) % (step.half_s + step.rest_s)
+    late = left_s < step.half_s / 4  # the end of each of the two pushes
+    size = np.abs(held[LEAD:][late])
+    settled = late if np.ptp(size) <= STEADY * size.mean() else np.full(len(at_s), True)
+    gains, dead_time_s, lag_s, explained = _fit_response(held, moved, settled)
+    if explained < LEAST_EXPLAINED:
         return "the motion does not follow the action"
-    trained = [_trained_motion(contract, channel, amount) for amount in (up, down)]
+    measured = gains[0] * action[0], gains[1] * action[1]
     return PushResult(
         axis=step.axis,
         motion=channel.motion,
-        unit=UNITS[channel.motion][0],
-        action=(up, down),
-        measured=(fit.gains[0] * up, fit.gains[1] * down),
-        trained=(trained[0], trained[1]),
-        dead_time_s=fit.dead_time_s,
-        time_63_s=fit.dead_time_s + fit.lag_s,
-        r_squared=fit.r_squared,
+        action=action,
+        measured=measured,
+        trained=(up, down),
+        ratio=(measured[0] / up, measured[1] / down),
+        dead_time_s=dead_time_s,
+        time_63_s=dead_time_s + lag_s,
     )
 
 
@@ -250,74 +222,44 @@ def _trained_motion(contract: Contract, channel: Channel, amount: float) -> floa
     sticks = [0.0] * 4
     sticks[channel.column] = amount
     motion = motion_of_sticks(contract, *sticks)[channel.column]
-    return motion if channel.motion == "speed" else math.degrees(motion)
+    return motion if channel.axis == "climb" else math.degrees(motion)
 
 
-class _Response(NamedTuple):
-    """Dead time, then a first-order lag; gains are motion per unit of action."""
-
-    gains: Sides
-    dead_time_s: float
-    lag_s: float
-    r_squared: float
-
-
-def _rested_gains(pushed: Array, moved: Array, late: list[Mask]) -> Array | None:
-    """Return the gain of each push from its end; None if the motion does not rest there."""
-    medians = [[np.median(half) for half in np.array_split(moved[end], 2)] for end in late]
-    earlier, later = np.array(medians).T
-    is_at_rest = np.all(np.abs(later - earlier) <= RESTED * np.abs(later))
-    return later / [pushed[end].mean() for end in late] if is_at_rest else None
-
-
-def _fit_response(held: Array, moved: Array, settled: Mask, known: Array | None) -> _Response:
+def _fit_response(held: Array, moved: Array, settled: Mask) -> tuple[Sides, float, float, float]:
     """Fit ``moved = gain * lag(held, dead time earlier)``, with a gain for each sign.
 
-    Gains not known are those of the samples ``settled``: all would give 10 % less for a full yaw
-    rate, 14 % for a full climb (bundled ArduPilot). A second fit leaves outliers out.
+    Return the gains, dead time and lag in s, and the share of the motion that they explain. Gains
+    are those of the samples ``settled``: all would give 10 % less for a full yaw rate, 14 % for a
+    full climb (bundled ArduPilot). Absolute errors count, so that gusts count little.
     """
     signs = np.stack([np.maximum(held, 0.0), np.minimum(held, 0.0)], axis=-1)
     share = (1.0 - np.exp(-STEP_S / LAGS_S))[:, None]
     lagged = np.zeros((len(held), len(LAGS_S), 2))
     for index, now in enumerate(signs[:-1]):  # an action takes effect from its own time on
         lagged[index + 1] = lagged[index] + share * (now - lagged[index])
-
-    def missed(dead: int, lag: int) -> tuple[Array, Array]:
-        """Return what a fit does not explain, and its gains."""
-        sides, told = lagged[LEAD - dead : len(lagged) - dead, lag], settled & kept
-        gains = np.linalg.lstsq(sides[told], moved[told], rcond=None)[0] if known is None else known
-        return moved - sides @ gains, gains
-
-    kept = np.full(len(moved), True)
-    deads, lags = range(0, MOST_DEAD + 1, STRIDE), range(0, len(LAGS_S), STRIDE)
-    for _ in range(2):
-        pairs = [(dead, lag) for dead in deads for lag in lags]
-        dead, lag = min(pairs, key=lambda pair: np.square(missed(*pair)[0][kept]).sum())
-        rest, gains = missed(dead, lag)
-        kept = np.abs(rest) <= max(OUTLIER_MADS * float(np.median(np.abs(rest))), 1e-9)
-        deads = range(max(dead - STRIDE, 0), dead + STRIDE + 1)
-        lags = range(max(lag - STRIDE, 0), min(lag + STRIDE + 1, len(LAGS_S)))
-    return _Response(
-        gains=(float(gains[0]), float(gains[1])),
-        dead_time_s=dead * STEP_S,
-        lag_s=float(LAGS_S[lag]),
-        r_squared=1.0 - float(np.square(rest).mean() / moved.var()),
-    )
+    fits = []
+    for dead in range(LEAD + 1):
+        for lag, lag_s in enumerate(LAGS_S.tolist()):
+            sides = lagged[LEAD - dead : len(lagged) - dead, lag]
+            gains = np.linalg.lstsq(sides[settled], moved[settled], rcond=None)[0]
+            fits.append((float(np.abs(moved - sides @ gains).sum()), dead * STEP_S, lag_s, gains))
+    missed, dead_time_s, lag_s, (up, down) = min(fits, key=lambda fit: fit[0])
+    explained = 1.0 - (missed + _NONE) / (float(np.abs(moved).sum()) + _NONE)
+    return (float(up), float(down)), dead_time_s, lag_s, explained
 
 
 def print_identification(found: Identification, contract: Contract, console: Console) -> None:
     """Print every push, the policy's hover thrust, and the missing results."""
     is_sticks = contract.action == "sticks"
-    given, expected = ("stick", "trained with") if is_sticks else ("commanded", "expected")
-    header = ["axis", given, "motion", "measured", expected, "ratio", "dead time", "63 %"]
+    header = ["axis", "action", "motion", "measured", "trained", "ratio", "dead time", "63 %"]
     rows = [
         [
             push.axis,
             f"{push.action[0]:.0%}" if is_sticks else f"{push.action[0]:.2f}",
-            f"{push.motion}, {push.unit}",
+            push.motion,
             "{:+.2f} {:+.2f}".format(*push.measured),
             "{:+.2f} {:+.2f}".format(*push.trained),
-            " ".join("-" if ratio is None else f"{ratio:.2f}" for ratio in push.ratio),
+            "{:.2f} {:.2f}".format(*push.ratio),
             f"{1e3 * push.dead_time_s:.0f} ms",
             f"{1e3 * push.time_63_s:.0f} ms",
         ]
@@ -329,20 +271,6 @@ def print_identification(found: Identification, contract: Contract, console: Con
         console.print(f"{told} trained with {contract.hover_thrust:.3f}")
     for line in found.missing:
         console.print(f"not measured: {line}", style="yellow")
-
-
-def as_document(
-    found: Identification, contract: Contract, config: IdentifyConfig
-) -> dict[str, object]:
-    """Return all results for ``--json``; a ratio is null if the policy expected no motion."""
-    return {
-        "policy": config.flight.policy.policy,
-        "action": contract.action,
-        "trained_hover_thrust": contract.hover_thrust,
-        "policy_hover_thrust": found.policy_hover_thrust,
-        "pushes": [asdict(push) | {"ratio": push.ratio} for push in found.pushes],
-        "missing": found.missing,
-    }
 
 
 def identify(config: IdentifyConfig) -> int:
@@ -362,7 +290,9 @@ def identify(config: IdentifyConfig) -> int:
         found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)
         if found.pushes:
             print_identification(found, trained, table_console())
-            write_json(config.json, as_document(found, trained, config))
+            names = {"policy": config.flight.policy.policy, "action": trained.action}
+            hover = {"trained_hover_thrust": trained.hover_thrust}
+            write_json(config.json, names | hover | asdict(found))
             return code
         missing = found.missing
     error: MavbridgeError = PeerError(f"nothing could be measured: {'; '.join(missing)}")

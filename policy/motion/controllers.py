@@ -52,7 +52,7 @@ class DoubletStep(NamedTuple):
     settle_s: float
     """Time with feedback after the pushes."""
     begin_s: float = 0.0
-    """Time since the program began."""
+    """Start of the push to the first side."""
 
     @property
     def back_s(self) -> float:
@@ -65,7 +65,7 @@ class DoubletStep(NamedTuple):
         return self.back_s + self.half_s
 
     def push_at(self, time_s: float) -> Push | None:
-        """Return the push at a time since the program began; None outside of this doublet."""
+        """Return the push at a time; None outside of this doublet."""
         if not self.begin_s <= time_s < self.end_s:
             return None
         if time_s >= self.back_s:
@@ -73,32 +73,25 @@ class DoubletStep(NamedTuple):
         return Push(self.axis, self.share if time_s < self.begin_s + self.half_s else 0.0)
 
 
-def _twice(axis: Axis, shares: tuple[float, float], *times_s: float) -> tuple[DoubletStep, ...]:
-    return tuple(DoubletStep(axis, share, *times_s) for share in shares)
-
-
 # Each doublet ends without net speed or height. Yaw and climb reach full range; leans do not, since
 # they may be twice as large as expected. All but leans also wait until an overshoot is over.
-_LEAN = (0.3, 0.6)
-_LEANS = (*_twice("roll", _LEAN, 1.2, 0.0, 3.0), *_twice("pitch", _LEAN, 1.2, 0.0, 3.0))
-_SPEEDS = (*_twice("roll", _LEAN, 3.0, 0.0, 3.0), *_twice("pitch", _LEAN, 3.0, 0.0, 3.0))
-_YAW = _twice("yaw", (0.5, 1.0), 3.0, 2.0, 3.5)
-_CLIMB = _twice("climb", (0.6, 1.0), 3.2, 1.7, 3.5)
+_ROLL = DoubletStep("roll", 0.6, 1.2, 0.0, 3.0)
+_PITCH = _ROLL._replace(axis="pitch")
+_YAW, _CLIMB = DoubletStep("yaw", 1.0, 3.0, 2.0, 3.5), DoubletStep("climb", 1.0, 3.2, 1.7, 3.5)
 _STEPS: dict[ActionKind, tuple[DoubletStep, ...]] = {
-    "sticks": (*_LEANS, *_YAW, *_CLIMB),
-    "attitude": (*_LEANS, *_YAW),
-    "rates": (*_LEANS, *_YAW),
-    "velocity": (*_SPEEDS, *_YAW, *_CLIMB),
+    "sticks": (_ROLL, _PITCH, _YAW, _CLIMB),
+    "attitude": (_ROLL, _PITCH, _YAW),
+    "rates": (_ROLL, _PITCH, _YAW),
+    "velocity": (_ROLL._replace(half_s=3.0), _PITCH._replace(half_s=3.0), _YAW, _CLIMB),
 }
 
 
-def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
-    """Return the doublets of an action kind: each axis, at two amplitudes, to both sides.
+def doublet_steps(action: ActionKind, begin_s: float = 0.0) -> tuple[DoubletStep, ...]:
+    """Return the doublets of an action kind, one for each axis, if the program begins at a time.
 
     Thrust has no gain to identify: the height balances it, and only its mean is reported.
     """
     steps: list[DoubletStep] = []
-    begin_s = 0.0
     for step in _STEPS[action]:
         steps.append(step._replace(begin_s=begin_s))
         begin_s = steps[-1].end_s + step.settle_s

@@ -22,7 +22,7 @@ def test_the_parameters_of_a_vehicle_are_found_in_flight() -> None:
     assert policy.program_start_s is not None
     found = identify_pushes(recording, contract=contract, program_start_s=policy.program_start_s)
     assert found.missing == ()
-    assert [push.axis for push in found.pushes[::2]] == ["roll", "pitch", "yaw", "climb"]
-    for push in found.pushes[1::2]:
+    assert [push.axis for push in found.pushes] == ["roll", "pitch", "yaw", "climb"]
+    for push in found.pushes:
         assert push.ratio == pytest.approx((0.5, 0.5), rel=0.04), push
         assert 0.03 < push.dead_time_s < push.time_63_s < 0.6
