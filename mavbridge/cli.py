@@ -148,7 +148,7 @@ def record(config: RecordConfig) -> int:
     """Record a human pilot's flights to learn from."""
     _require_vehicle(config.vehicle.connect)
     require_extra("record")
-    from mavbridge.commands.record.run import record as run_recording
+    from mavbridge.commands.record import record as run_recording
 
     return run_recording(config)
 
@@ -194,7 +194,7 @@ def serve(config: ServeConfig = ServeConfig()) -> int:
 def imagine(config: ImagineConfig) -> int:
     """Imagine a flight by a policy and a world model."""
     require_extra("imagine")
-    from mavbridge.commands.imagine.run import imagine as run_rollout
+    from mavbridge.commands.imagine import imagine as run_rollout
 
     return run_rollout(config)
 

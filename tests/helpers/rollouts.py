@@ -13,7 +13,8 @@ from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import count_frames, write_recording
-from mavbridge.commands.imagine.loop import (
+from mavbridge.commands.imagine import SCHEMA, StreamedOutput
+from mavbridge.commands.imagine_rollout import (
     Decider,
     PolicyDecider,
     RolloutPlan,
@@ -23,7 +24,6 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import SCHEMA, StreamedOutput
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks

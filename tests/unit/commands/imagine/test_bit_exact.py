@@ -11,7 +11,7 @@ import pytest
 
 from helpers.recordings import count_frames
 from helpers.rollouts import Finished, make_plan, make_sampler, read_rows, run, segments
-from mavbridge.commands.imagine.loop import DECIDE, SIMULATE, RolloutPlan
+from mavbridge.commands.imagine_rollout import DECIDE, SIMULATE, RolloutPlan
 
 THREAD = "mavbridge-rollout-decode"
 

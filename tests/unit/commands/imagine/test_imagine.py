@@ -14,9 +14,8 @@ import pytest
 from helpers.recordings import count_frames, read_video
 from helpers.rollouts import TinyWorld, read_rows, write_flight
 from helpers.status import status_of, told_by
-from mavbridge.commands.imagine import run
-from mavbridge.commands.imagine.loop import PolicyDecider, Sampler
-from mavbridge.commands.imagine.run import SHIPPED
+from mavbridge.commands.imagine import SHIPPED, StreamedOutput
+from mavbridge.commands.imagine_rollout import PolicyDecider, Sampler
 from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.networks import load_world_model, save_world_model
 from policy.preprocess import resize
@@ -73,14 +72,12 @@ def test_ctrl_c_finishes_what_is_there(
 def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
     imagine: Imagine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start_output = run.StreamedOutput
-
     def start(*arguments: object, **named: object) -> object:
-        made = start_output(*arguments, **named)  # type: ignore[arg-type]
+        made = StreamedOutput(*arguments, **named)  # type: ignore[arg-type]
         os.kill(made.video._process.pid, signal.SIGKILL)  # type: ignore[union-attr, arg-type]
         return made
 
-    monkeypatch.setattr(run, "StreamedOutput", start)
+    monkeypatch.setattr("mavbridge.commands.imagine.StreamedOutput", start)
     status, text = imagine("--n-iter", "100")
     assert status == 2
     assert "the writer process has died" in text

@@ -19,8 +19,8 @@ from helpers.rollouts import (
     noise_runner,
     write_flight,
 )
-from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider, rollout
-from mavbridge.commands.imagine.run import read_start
+from mavbridge.commands.imagine import read_start
+from mavbridge.commands.imagine_rollout import ObservationQueue, PolicyDecider, rollout
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from helpers.recordings import count_frames, read_video, send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
-from mavbridge.commands.imagine.loop import RolloutError, Segment
-from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.commands.imagine import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.commands.imagine_rollout import RolloutError, Segment
 from mavbridge.core.stopping import HungError
 from mavbridge.recording.tables import TableWriter
 
@@ -126,7 +126,7 @@ def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
             go_on.wait(DEADLINE_S)
             return super().decode(latents)
 
-    monkeypatch.setattr("mavbridge.commands.imagine.output.STALL_S", 0.0)
+    monkeypatch.setattr("mavbridge.commands.imagine.STALL_S", 0.0)
     with output(tmp_path / "a.mp4", Hangs()) as made:
         with pytest.raises(HungError, match="no frame"):
             put_all(made)

@@ -1,7 +1,7 @@
 import pytest
 
 from helpers.factories import make_tick
-from mavbridge.commands.record.episodes import EpisodeControl
+from mavbridge.commands.record_episodes import EpisodeControl
 from mavbridge.core.clock import NS_PER_MS
 
 STEP_NS = 50 * NS_PER_MS

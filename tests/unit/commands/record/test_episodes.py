@@ -9,8 +9,8 @@ import pytest
 from helpers.factories import make_plan, make_tick
 from helpers.fakes import START_NS, FakeClock
 from helpers.recordings import make_frame
-from mavbridge.commands.record import episodes
-from mavbridge.commands.record.episodes import Episodes, disk_left_gb, prepare_out
+from mavbridge.commands import record_episodes as episodes
+from mavbridge.commands.record_episodes import Episodes, disk_left_gb, prepare_out
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight

@@ -14,8 +14,13 @@ from rich.console import Console
 from helpers.factories import make_guard_tick, make_plan, make_tick
 from helpers.fakes import START_NS, ListSink
 from mavbridge.commands.config import ListenConfig, RecordConfig
-from mavbridge.commands.record.run import CONTRACT, pilot_flight
-from mavbridge.commands.record.view import PilotView, RecordScreen, session_status
+from mavbridge.commands.record import (
+    CONTRACT,
+    PilotView,
+    RecordScreen,
+    pilot_flight,
+    session_status,
+)
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.reasons import Code, because
@@ -57,7 +62,7 @@ def test_the_guard_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(
 
 
 def test_no_network_is_loaded_to_record() -> None:
-    code = "import sys, mavbridge.commands.record.run; sys.exit('torch' in sys.modules)"
+    code = "import sys, mavbridge.commands.record; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
