@@ -170,13 +170,13 @@ def replay(flight: Path, config: ReplayConfig = ReplayConfig()) -> int:
 
 @cli.command(group=REVIEWING)
 def inspect(*flights: Path, config: InspectConfig = InspectConfig()) -> int:
-    """Report on a recorded flight, or compare two: rates, latency, releases.
+    """Report on recorded flights: rates, latency, releases.
 
     Args:
-        flights: one or two flight folders, as --record makes them.
+        flights: flight folders, as --record makes them.
     """
     require_extra("inspect")
-    from mavbridge.commands.inspect.run import inspect as run_inspection
+    from mavbridge.commands.inspect import inspect as run_inspection
 
     return run_inspection(flights, config)
 

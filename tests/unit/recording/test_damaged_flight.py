@@ -12,7 +12,7 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, number_of, write_recording
 from mavbridge.commands.config import InspectConfig
-from mavbridge.commands.inspect.run import inspect
+from mavbridge.commands.inspect import inspect
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import FlightError
 from policy.data.flight_data import DatasetError

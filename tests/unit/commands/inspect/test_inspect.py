@@ -16,16 +16,15 @@ from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.programs import ended
 from helpers.recordings import make_frame, make_meta, write_recording
 from mavbridge.commands.config import InspectConfig
+from mavbridge.commands.inspect import _events as events_of
+from mavbridge.commands.inspect import inspect, print_flight
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.page import page_data
-from mavbridge.commands.inspect.run import _events as events_of
-from mavbridge.commands.inspect.run import inspect, print_comparison, print_flight
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import FlightOutcome, Position, Tick, VehicleState, VisionTick
-from mavbridge.recording.folder import read_meta
 from policy.contract import Contract
 
 GOLDEN = Path(__file__).parents[3] / "data/flights"
@@ -61,12 +60,9 @@ def flight_with_a_stall() -> list[Tick]:
     return ticks
 
 
-def shown(flight: FlightAnalysis, *others: FlightAnalysis, width: int = 80) -> str:
-    console = Console(width=width, record=True, file=io.StringIO())
-    if others:
-        print_comparison([flight, *others], console)
-    else:
-        print_flight(flight, console)
+def shown(flight: FlightAnalysis) -> str:
+    console = Console(width=80, record=True, file=io.StringIO())
+    print_flight(flight, console)
     return console.export_text()
 
 
@@ -75,7 +71,7 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("stalled") / "flight", flight_with_a_stall())
 
 
-def test_one_flight_is_told_with_its_figures_causes_and_moments(
+def test_each_flight_is_told_with_its_figures_causes_and_moments(
     stalled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flight = FlightAnalysis(stalled)
@@ -85,14 +81,17 @@ def test_one_flight_is_told_with_its_figures_causes_and_moments(
     assert all(len(line) <= 80 for line in text.splitlines())
     for expected in ("the policy took long (1)", str(LINK_LOST), "9.0 ms late", "predict"):
         assert expected in " ".join(text.split())
-    assert inspect([stalled], InspectConfig(json=tmp_path / "figures.json")) == 0
-    (document,) = json.loads((tmp_path / "figures.json").read_text())
+    other = write(tmp_path / "other", flown(9))
+    assert inspect([stalled, other], InspectConfig(json=tmp_path / "figures.json")) == 0
+    document, second = json.loads((tmp_path / "figures.json").read_text())
+    assert second["report"]["sticks"]["sends"] == 9
     assert document["report"]["sticks"]["sends"] == 89
     assert document["causes"] == {"the policy took long": 1}
     release = {"t_s": 0.9, "reason": reason_to_json(LINK_LOST)}
     assert document["report"]["releases"] == [release]
     assert [span["reason"] for span in document["holders"][1:]] == [None, release["reason"]]
-    assert "The worst moments" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert told.index("The worst moments") < told.index(str(other))
 
 
 def test_a_terminal_without_utf8_gets_escapes_and_the_page_is_whole(tmp_path: Path) -> None:
@@ -128,22 +127,6 @@ def test_plots_hold_what_was_sent_and_axes_of_ros_become_ned_axes(tmp_path: Path
         ("Body rates", [0, 0, -28.6479]),
     ):
         assert last[title] == pytest.approx(expected, abs=1e-3), title
-
-
-def test_two_flights_side_by_side_mark_what_differs(stalled: Path, tmp_path: Path) -> None:
-    steady = [make_tick(index, predict_ns=4 * NS_PER_MS) for index in range(100)]
-    outcome = read_meta(GOLDEN / "toge_ardupilot").outcome
-    meta = make_meta(policy="toge").with_outcome(replace(outcome, gates_passed=5))
-    second = FlightAnalysis(write(tmp_path / "second", steady, meta=meta))
-    lines = shown(FlightAnalysis(stalled), second).splitlines()
-    assert all(len(line) <= 80 for line in lines)
-    cells = [[cell.strip() for cell in line.split("│")] for line in lines if "│" in line]
-    rows = {name: values for _, name, *values in cells}
-    assert rows["policy"][:3] == ["scripted:hover", "toge", "differs"]
-    assert rows["late chunks"][:3] == ["1", "0", "-100%"]
-    assert rows["predict, p50 [ms]"][2] == "+100%"
-    assert rows["gates passed"][:2] == ["-", "5"]
-    assert rows["path [m]"][:3] == ["8.8", "-", "-"], "no position is no path of 0 m"
 
 
 def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
