@@ -129,7 +129,7 @@ def check(config: CheckConfig = CheckConfig()) -> int:
     --connect none, --policy none and --camera none leave those out. Exit status: 0 go, 3 no-go.
     """
     _require_vehicle(config.flight.link.connect)
-    from mavbridge.commands.check.run import check as run_check
+    from mavbridge.commands.check import check as run_check
 
     return run_check(config)
 

@@ -55,5 +55,4 @@ def test_a_soak_measures_this_computer_at_the_bundled_vehicle(tmp_path: Path) ->
     assert soak["timing"]["action"]["rate_hz"] > 0
     assert soak["timing"]["vision"]["rate_hz"] > 0
     assert 0 < soak["cpu_cores"]["guard"] < 1
-    assert soak["computer"]["kernel"]
     assert [row["area"] for row in document["rows"] if row["name"] == "soak"] == ["computer"]

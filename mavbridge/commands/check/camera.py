@@ -3,22 +3,28 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from statistics import median
 
 from mavbridge.camera.image_watch import is_blank
-from mavbridge.camera.open import open_camera, require_present
-from mavbridge.commands.check.rows import CheckRow
-from mavbridge.config.flight import CameraConfig
+from mavbridge.camera.open import NO_CAMERA, open_camera, require_present
+from mavbridge.commands.check.rows import NO_VEHICLE, CheckRow
+from mavbridge.commands.output import print_status
+from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
 from mavbridge.core.records import Camera, CameraImage
-from mavbridge.flight.policies import NO_IMAGE_ADVICE
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.policies import NO_IMAGE_ADVICE, looks_at_images, require_images
+from policy.contract import Contract
+from policy.preprocess import least_source_px
 
 MEASURE_S = 2.0
 _READ_NS = NS_PER_S // 2
 _ENOUGH = 0.9
 """Least acceptable share of the wanted rate."""
+_cameras_row = partial(CheckRow, "camera", "cameras")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +68,53 @@ class CameraView:
             return 0.0
         span_ns = self.captured_ns[-1] - self.captured_ns[0]
         return (len(self.captured_ns) - 1 + self.dropped) * NS_PER_S / span_ns if span_ns else 0.0
+
+
+def check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:
+    """Return rows on every camera of the flight, or on the flags that do not fit the policy."""
+    is_blind = set(config.camera.sources) == {NO_CAMERA}
+    if is_blind and config.link.connect == NO_VEHICLE:
+        return []  # only this computer is checked
+    try:
+        require_images(config)
+        needs = [] if is_blind else _camera_needs(config, plan)
+    except MavbridgeError as error:
+        return [_cameras_row(" ".join(config.camera.sources), no_go=str(error))]
+    if not needs:
+        return [_cameras_row("none", "none for this flight")]
+    print_status("watching the camera")
+    return camera_rows(needs, config.camera, clock)
+
+
+def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeeds]:
+    """Return the flight's needs of each camera; raise UserError if their names do not fit.
+
+    Without a policy only cameras named by flags are checked.
+    """
+    if plan is None:
+        if config.camera == CameraConfig():
+            return []
+        contract = Contract()
+        names, sources = config.camera.sources, config.camera.sources
+        rates_hz = (config.rates.visual_rate,) * len(sources)
+        max_age_s = contract.max_feature_age_s
+    else:
+        contract = plan.contract
+        names, sources = contract.cameras, config.camera.sources_of(contract.cameras)
+        rates_hz = plan.image_rates_hz
+        max_age_s = plan.start_limits.feature_ns / NS_PER_S
+    return [
+        CameraNeeds(
+            name=name if len(names) > 1 else "",
+            source=source,
+            rate_hz=rate_hz,
+            size_px=least_source_px(contract),
+            max_age_s=max_age_s,
+            is_flown_by=looks_at_images(config),
+            is_depth=None if plan is None else contract.is_depth,
+        )
+        for name, source, rate_hz in zip(names, sources, rates_hz, strict=False)
+    ]
 
 
 def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[CheckRow]:

@@ -8,6 +8,7 @@ from functools import partial
 
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.commands.config import NO_POLICY
+from mavbridge.commands.output import print_status
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -43,6 +44,7 @@ def check_policy(
     """
     if config.policy.policy == NO_POLICY:
         return [], None
+    print_status(f"loading the policy, then running it for {timing_s:g} s")
     try:
         in_air = config.takeoff is not None
         with load_configured_policy(config.policy, clock, starts_in_air=in_air) as loaded:

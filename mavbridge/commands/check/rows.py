@@ -11,6 +11,8 @@ from rich.text import Text
 from mavbridge.commands.output import PIPED_WIDTH
 from mavbridge.core.provenance import without_secrets
 
+NO_VEHICLE = "none"
+"""Value of ``--connect`` of a check without a vehicle."""
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
 _STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}

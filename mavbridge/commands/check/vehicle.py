@@ -6,7 +6,8 @@ from dataclasses import replace
 from functools import partial
 
 from mavbridge.commands.check.params import Terms, param_rows
-from mavbridge.commands.check.rows import CheckRow
+from mavbridge.commands.check.rows import NO_VEHICLE, CheckRow
+from mavbridge.commands.output import print_status
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError
@@ -110,6 +111,9 @@ def check_vehicle(
 
     ``plan`` is None if no policy flies. ``transport`` replaces that of the address in ``config``.
     """
+    if config.link.connect == NO_VEHICLE:
+        return [_link_row("vehicle", "none", "none for this check")]
+    print_status(f"listening to the vehicle on {config.link.connect}")
     is_dual = plan is None or plan.is_dual
     settings = link_settings(config, config.rates.loops(is_dual=is_dual))
     settings = replace(settings, readonly=True, set_params=())

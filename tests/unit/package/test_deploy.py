@@ -56,7 +56,7 @@ def test_the_simulator_says_what_it_lacks() -> None:
     assert refused.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
 
 
-@pytest.mark.parametrize("module", ["flight.app", "commands.check.run", "commands.convert"])
+@pytest.mark.parametrize("module", ["flight.app", "commands.check", "commands.convert"])
 def test_flights_and_conversions_need_no_extra(module: str) -> None:
     code = "import sys; sys.modules.update(dict.fromkeys(['av', 'pyarrow.parquet', 'mujoco'])); "
     code += f"import mavbridge.{module}"

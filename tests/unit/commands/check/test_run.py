@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from helpers.fakes import FakeClock
+from mavbridge.commands.check import check
 from mavbridge.commands.check.policy import Pace, check_policy
 from mavbridge.commands.check.rows import CheckRow, as_document, print_check
-from mavbridge.commands.check.run import check
 from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig

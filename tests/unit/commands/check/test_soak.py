@@ -1,4 +1,4 @@
-"""The figures of a soak, the description of a computer, and the row of both."""
+"""The figures of a soak, and its row."""
 
 import os
 from dataclasses import replace
@@ -10,22 +10,20 @@ import pytest
 from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.fakes import FakeClock
 from helpers.reports import report_of
-from mavbridge.commands.check import soak
-from mavbridge.commands.check.soak import (
+from mavbridge.commands.check import computer
+from mavbridge.commands.check.computer import (
     CLIMB_STICK,
     USAGE_NS,
     Soak,
     UsageMeter,
     climb_config,
-    hottest_c,
     level_climb,
     require_whole,
-    this_computer,
-    used_ns,
 )
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
+from mavbridge.core.realtime import usable_cores
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from policy.contract import Contract
@@ -90,21 +88,18 @@ def test_a_row_warns_of_missed_slots_and_of_rates_that_are_not_held() -> None:
     clock = FakeClock()
     meter = UsageMeter(clock, os.getpid())
     meter.emit(WAITING)
-    assert meter.cores == {}
     meter.emit(FLOWN[0])
     sum(range(200_000))  # some processor time
     clock.advance_ns(USAGE_NS)
     meter.emit(FLOWN[-1])
     assert 0 < meter.cores["flight"] < 1
-    assert "flight/MainThread" in meter.cores
-    computer = this_computer() | {"cores": 2}
-    measured = Soak(computer=computer, timing=report, cpu_cores=meter.cores, hottest_c=71.4)
+    measured = Soak(timing=report, cpu_cores=meter.cores, hottest_c=71.4)
     row = measured.row()
     assert row.verdict == "warn"
     assert "missed slots" in row.warn
     assert "rate" not in row.warn
     assert "3 of 100 slots missed" in row.found
-    assert "of 2 cores, 71 degrees" in row.found
+    assert f"of {usable_cores()} cores, 71 degrees" in row.found
     slow = replace(report, action=replace(report.action, rate_hz=90.0))
     assert "does not hold the rate of chunks" in replace(measured, timing=slow).row().warn
 
@@ -112,14 +107,14 @@ def test_a_row_warns_of_missed_slots_and_of_rates_that_are_not_held() -> None:
 def test_figures_of_the_computer_are_the_kernels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(soak, "PROC", tmp_path)
-    monkeypatch.setattr(soak, "SYS", tmp_path)
-    assert used_ns(7)["guard"] == 0
-    assert (hottest_c(), this_computer()["model"]) == (None, "")
+    monkeypatch.setattr(computer, "PROC", tmp_path)
+    monkeypatch.setattr(computer, "SYS", tmp_path)
+    clock = FakeClock()
+    meter = UsageMeter(clock, 7)
+    meter.emit(FLOWN[0])
+    assert (meter.cores["guard"], meter.hottest_c) == (0, None)
     files = {
         "7/schedstat": "5000000 3000000 12\n",
-        "cpuinfo": "processor\t: 0\nmodel name\t: Some CPU\n",
-        "device-tree/model": "Raspberry Pi 5\0",
         "class/thermal/thermal_zone0/temp": "48500\n",
         "class/thermal/thermal_zone1/temp": "61000\n",
         "class/thermal/thermal_zone2/temp": "unknown\n",
@@ -128,6 +123,7 @@ def test_figures_of_the_computer_are_the_kernels(
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    assert used_ns(7)["guard"] == 5 * NS_PER_MS
-    here = this_computer()
-    assert (here["model"], here["cpu"], hottest_c()) == ("Raspberry Pi 5", "Some CPU", 61.0)
+    clock.advance_ns(USAGE_NS)
+    meter.emit(FLOWN[1])
+    assert meter.cores["guard"] == pytest.approx(5 * NS_PER_MS / USAGE_NS)
+    assert meter.hottest_c == 61.0

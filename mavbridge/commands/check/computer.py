@@ -1,30 +1,35 @@
-"""``check --soak``: this policy at the bundled vehicle for a while, measured on this computer.
+"""Rows about this computer: cores, rights, the files of the flight, and a soak.
 
-A policy that crashes its vehicle could not be measured for long. Therefore each chunk is computed
-in full, and then its values are replaced by the sticks of a slow level climb.
+A soak flies the policy at the bundled vehicle for a while. One that crashes its vehicle could not
+be measured for long. Therefore each chunk is computed in full, and then its values are replaced by
+the sticks of a slow level climb.
 """
 
-import platform
 import sys
-import threading
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import TimeoutError as PoolTimeoutError
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.policy import HELD
 from mavbridge.commands.check.rows import CheckRow
+from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
+from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.processes import free_port, log_tail, running
-from mavbridge.core.provenance import versions
-from mavbridge.core.realtime import usable_cores
+from mavbridge.core.realtime import settle_guard, usable_cores
 from mavbridge.core.reasons import Kind
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_policy
+from mavbridge.flight.checks import file_checks, output_folders
 from mavbridge.flight.guard_process import start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
@@ -34,8 +39,11 @@ from mavbridge.observe.timing import FlightTiming, TimingReport
 from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 
+_CORES = 2
+"""One core for the guard and one for the policy, so that neither delays the other."""
+_TRIAL_S = 20
+"""Time in which a new process must have tried the rights of the guard."""
 PROC, SYS = Path("/proc"), Path("/sys")
-_GOVERNOR = "devices/system/cpu/cpu0/cpufreq/scaling_governor"
 CLIMB_STICK = 0.3
 """Stick for 0.3 m/s up in ALT_HOLD: beyond the dead zone, some 20 m per minute."""
 NO_CEILING = EnvelopeConfig(max_height=0.0)
@@ -46,44 +54,51 @@ LEAST_SHARE = 0.95
 """Minimum share of the requested duration; a flight that ended earlier is no measurement."""
 USAGE_NS = NS_PER_S // 4
 """Time between two readings of processor times and temperature."""
+_row = partial(CheckRow, "computer")
 
 
-def this_computer() -> dict[str, object]:
-    """Describe this computer; an empty text is unknown."""
-    lines = _text(PROC / "cpuinfo").splitlines()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return {
-        "model": _text(PROC / "device-tree/model").strip("\0"),  # of a Raspberry Pi or a Jetson
-        "cpu": next(names, platform.processor() or "unknown processor"),
-        "machine": platform.machine(),
-        "cores": usable_cores(),
-        "kernel": platform.release(),
-        "governor": _text(SYS / _GOVERNOR),
-        "versions": versions(),
-    }
+def computer_rows(config: FlyConfig) -> Iterator[CheckRow]:
+    """Yield rows about cores, real-time scheduling, locked memory, and the files of the flight."""
+    cores = usable_cores()
+    shared = "guard and policy share one core: a slow policy delays the sticks"
+    yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
+    try:  # in a process of its own, so that this one is not affected
+        with get_context("spawn").Pool(1) as pool:
+            trial = pool.apply_async(settle_guard, kwds={"realtime": config.rates.realtime})
+            refused = trial.get(_TRIAL_S) or ""
+    except PoolTimeoutError:
+        refused = f"the rights of the guard could not be tried: no answer in {_TRIAL_S} s"
+    except OSError as error:
+        refused = f"the rights of the guard could not be tried: {error}"
+    yield _row(
+        "rights of the guard",
+        "refused in part" if refused else "granted",
+        "SCHED_FIFO and locked memory" if config.rates.realtime else "locked memory",
+        refused,
+    )
 
 
-def hottest_c() -> float | None:
+def file_rows(config: FlyConfig) -> Iterator[CheckRow]:
+    """Yield a row on each file that the flight uses, and on its viewer."""
+    with empty_folders_removed(*output_folders(config)):
+        for name, value, check_file in file_checks(config):
+            try:
+                check_file()
+                yield _row(name, str(value))
+            except MavbridgeError as error:
+                yield _row(name, str(value), no_go=str(error))
+
+
+def _hottest_c() -> float | None:
     """Return the highest temperature that the kernel tells [degrees Celsius]; None: it tells
     none."""
     texts = (_text(zone) for zone in SYS.glob("class/thermal/thermal_zone*/temp"))
     return max((int(text) / 1000 for text in texts if text.lstrip("-").isdigit()), default=None)
 
 
-def used_ns(guard_pid: int) -> dict[str, int]:
-    """Return the processor times so far of the processes "flight" (this one) and "guard", and, as
-    "flight/NAME", of each thread of this process; "flight/others" are threads of libraries."""
-    names = {thread.native_id: thread.name for thread in threading.enumerate()}
-    used = {"flight": time.process_time_ns(), "guard": _ran_ns(PROC / str(guard_pid))}
-    for task in (PROC / "self/task").glob("*"):
-        name = f"flight/{names.get(int(task.name), 'others')}"
-        used[name] = used.get(name, 0) + _ran_ns(task)
-    return used
-
-
-def _ran_ns(process: Path) -> int:
-    """Return the time for which a process or thread ran (sched-stats.rst); 0: not told."""
-    return int((_text(process / "schedstat").split() or ["0"])[0])
+def _ran_ns(pid: int) -> int:
+    """Return the time for which a process ran (sched-stats.rst); 0: not told."""
+    return int((_text(PROC / str(pid) / "schedstat").split() or ["0"])[0])
 
 
 def _text(path: Path) -> str:
@@ -100,9 +115,9 @@ class UsageMeter:
     def __init__(self, clock: Clock, guard_pid: int) -> None:
         self._clock = clock
         self._guard_pid = guard_pid
-        self._first: tuple[int, dict[str, int]] | None = None
-        """Time of the first reading, and the times used so far."""
-        self._last: tuple[int, dict[str, int]] = (0, {})
+        self._first: tuple[int, int, int] | None = None
+        """Time of the first reading, then the processor times of this process and the guard."""
+        self._last = (0, 0, 0)
         self.hottest_c: float | None = None
 
     def emit(self, event: Event) -> None:
@@ -112,28 +127,24 @@ class UsageMeter:
         now_ns = self._clock.now_ns()
         if self._first is not None and now_ns - self._last[0] < USAGE_NS:
             return
-        self._last = now_ns, used_ns(self._guard_pid)
+        self._last = now_ns, time.process_time_ns(), _ran_ns(self._guard_pid)
         self._first = self._first or self._last
-        heats_c = [heat_c for heat_c in (self.hottest_c, hottest_c()) if heat_c is not None]
+        heats_c = [heat_c for heat_c in (self.hottest_c, _hottest_c()) if heat_c is not None]
         self.hottest_c = max(heats_c, default=None)
 
     @property
     def cores(self) -> dict[str, float]:
-        """Processor time over elapsed time, by the names of ``used_ns``."""
-        (begin_ns, before), (end_ns, after) = self._first or self._last, self._last
-        elapsed_ns = max(end_ns - begin_ns, 1)
-        return {
-            name: round((used - before.get(name, 0)) / elapsed_ns, 3)
-            for name, used in after.items()
-        }
+        """Processor time over elapsed time of the processes "flight" (this one) and "guard"."""
+        pairs = zip(self._first or self._last, self._last, strict=True)
+        elapsed_ns, flight_ns, guard_ns = (after - before for before, after in pairs)
+        used_ns = {"flight": flight_ns, "guard": guard_ns}
+        return {name: round(each_ns / max(elapsed_ns, 1), 3) for name, each_ns in used_ns.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Soak:
     """Result of a soak."""
 
-    computer: dict[str, object]
-    """See ``this_computer``."""
     timing: TimingReport
     """As in a flight's report."""
     cpu_cores: dict[str, float]
@@ -154,15 +165,26 @@ class Soak:
             warnings.append("the guard was late: see missed slots in docs/timing.md")
         heat = "" if self.hottest_c is None else f", {self.hottest_c:.0f} degrees"
         cores = self.cpu_cores["flight"] + self.cpu_cores["guard"]
-        return CheckRow(
-            "computer",
+        return _row(
             "soak",
             f"{sticks.flying_s:.0f} s, {sticks.missed_slots} of {sticks.slots} slots missed; "
             f"chunks {number(action.rate_hz, 1)} Hz, images {number(vision.rate_hz, 1)} Hz, "
-            f"{cores:.2f} of {self.computer['cores']} cores{heat}",
+            f"{cores:.2f} of {usable_cores()} cores{heat}",
             f"no slot missed, {action.target_hz:g} and {vision.target_hz:g} Hz",
             warn="; ".join(warnings),
         )
+
+
+def check_soak(
+    config: FlyConfig, clock: Clock, *, duration_s: float
+) -> tuple[CheckRow, Soak | None]:
+    """Soak the policy for ``duration_s``; a failure becomes a row."""
+    print_status(f"flying the bundled vehicle for {duration_s:g} s")
+    try:
+        soaked = soak(config, clock, duration_s=duration_s)
+    except MavbridgeError as error:
+        return _row("soak", "not flown", no_go=str(error)), None
+    return soaked.row(), soaked
 
 
 def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
@@ -225,7 +247,6 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> So
     )
     require_whole(report, config.duration or 0.0)
     return Soak(
-        computer=this_computer(),
         timing=report,
         cpu_cores=usage.cores,
         hottest_c=usage.hottest_c,
