@@ -1,18 +1,14 @@
 """Conversion of torch policies to OpenVINO graphs.
 
-The policy's methods are traced with all modules that it holds: the policy itself if it is a module,
-else those among its attributes. For a user's policy ``torch.export`` runs first, on shapes alone:
-it rejects decisions by the values of a tensor, which a trace would silently freeze, and it gives
-the size and content of the graph before the slow conversion begins. A built-in network is known by
-its configuration and weights.
+The policy's methods are traced with all modules that it holds. For a user's modules
+``torch.export`` runs first, on shapes alone: it rejects decisions by the values of a tensor, which
+a trace would silently freeze, and it gives the size and content of the graph before the slow
+conversion begins. A built-in network is known by its configuration and weights.
 """
 
-import builtins
 import contextlib
 import hashlib
 import logging
-import math
-import operator
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -20,10 +16,8 @@ from typing import Any
 
 import openvino as ov
 import torch
-from torch import Tensor, fx, nn
+from torch import Tensor, nn
 from torch.export import ExportedProgram
-from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_leaves
 
 from policy.engines.openvino_compile import (
     compile_graph,
@@ -46,16 +40,6 @@ from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
 _DECIDES = "it decides by the values of a tensor, which a graph cannot"
-_READS = frozenset(
-    (
-        *("__bool__", "__int__", "__float__", "__index__", "__contains__", "__array__"),
-        *("item", "tolist", "numpy", "equal", "allclose", "is_nonzero"),
-        *("nonzero", "argwhere", "masked_select", "unique", "unique_consecutive", "bincount"),
-    )
-)
-"""Functions that give Python the value of a tensor, or a size that depends on values; a trace would
-silently freeze it."""
-_OF_PYTHON = min, max, math.pow
 MAX_OPERATIONS = 4000
 """Largest number of operations in one graph, 3 ms each to convert; ten unrolled steps of a TOGE are
 2,700, one is 500."""
@@ -148,9 +132,8 @@ def _float_tensor(result: object) -> Tensor:
 
 
 def _exported(module: "Traceable", examples: tuple[Tensor, ...]) -> ExportedProgram:
-    exportable = Traceable(module.held, _by_pythons_own(module.function))
     try:
-        program = torch.export.export(exportable, examples, strict=False)
+        program = torch.export.export(module, examples, strict=False)
     except PolicyError:
         raise
     except Exception as error:
@@ -158,42 +141,9 @@ def _exported(module: "Traceable", examples: tuple[Tensor, ...]) -> ExportedProg
         if "data-dependent" in first:
             raise PolicyError(_DECIDES) from error
         raise PolicyError(f"torch.export: {type(error).__name__}: {first}") from error
-    varying, owners = set(program.graph_signature.user_inputs), dict[str, str]()
-    for node in program.graph.nodes:  # in order of execution
-        owners[node.name] = owner = owners.get(_shared(node), node.name)
-        if any(owners[read.name] in varying for read in node.all_input_nodes):
-            varying.add(owner)
-            if node.target is torch.ops.aten.item.default:
-                raise PolicyError(_DECIDES)
+    if any(node.target is torch.ops.aten.item.default for node in program.graph.nodes):
+        raise PolicyError(_DECIDES)
     return program
-
-
-def _by_pythons_own(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function with Python's ``min``, ``max`` and ``math.pow``, as a trace calls them.
-
-    ``torch.export`` replaces them by others, which do not decide by values.
-    """
-
-    def call(*arrays: Tensor) -> Any:
-        replaced = builtins.min, builtins.max, math.pow
-        builtins.min, builtins.max, math.pow = _OF_PYTHON
-        try:
-            return function(*arrays)
-        finally:
-            builtins.min, builtins.max, math.pow = replaced
-
-    return call
-
-
-def _shared(node: fx.Node) -> str:
-    """Return the name of the node that this one views or writes in place; empty if none."""
-    if node.target is operator.getitem:  # of several views
-        return node.all_input_nodes[0].name
-    schema = getattr(node.target, "_schema", None)
-    for number, argument in enumerate(schema.arguments if schema is not None else ()):
-        if argument.alias_info is not None:
-            return str(node.kwargs.get(argument.name) or node.args[number])
-    return ""
 
 
 def _require_bounded(program: ExportedProgram) -> None:
@@ -234,27 +184,8 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
             yield node.name, stored[target], len(node.users)
 
 
-class _Undecided(TorchFunctionMode):
-    """Raises PolicyError where Python reads a tensor's value; what TorchScript reads is kept."""
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
-    ) -> Any:
-        is_list = func is torch.as_tensor and isinstance(next(iter(args), None), list)
-        copied = tree_leaves((args, kwargs)) if is_list or func is torch.tensor else []
-        index = tree_leaves(args[1:]) if func.__name__ == "__getitem__" else []
-        masks = [i for i in index if isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8)]
-        is_search = func.__name__ == "where" and len(args) + len(kwargs or ()) == 1
-        is_read = masks or is_search or func.__name__ in _READS
-        if is_read or any(isinstance(each, Tensor) for each in copied):
-            raise PolicyError(_DECIDES)
-        return func(*args, **(kwargs or {}))
-
-
 def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
     """Return a digest, as ``_digest``, of a module that calls TorchScript."""
-    with _Undecided():
-        module(*examples)
     graph = _traced(module, examples).inlined_graph
     operations = sum(1 for _ in graph.nodes())
     if operations > MAX_SCRIPT_OPERATIONS:

@@ -1,6 +1,5 @@
 """Shared code of all engines: wrap a policy as a ``PolicyRunner`` and try it before it flies."""
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -35,8 +34,6 @@ class ExecutionSettings:
     num_diffusion_steps: int = 10
     dual_rate: bool = True
     """``encode`` runs the image path; needs a ``DualRatePolicy``."""
-    threads: frozenset[threading.Thread] | None = None
-    """Threads that ran before the policy was made, which started the later ones; None: unknown."""
 
 
 ArrayFunction = Callable[..., FloatArray]

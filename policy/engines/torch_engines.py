@@ -1,30 +1,10 @@
-"""Engines of torch: operator by operator, the reference for every other engine, and CUDA graphs.
-
-And what a user's policy holds: its modules, and the attributes that change from call to call.
-"""
+"""Engines of torch: operator by operator, the reference for every other engine, and CUDA graphs."""
 
 import copy
-import gc
-import hashlib
-import re
 import sys
-from collections import UserDict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import _lru_cache_wrapper, partial
-from io import IOBase
-from itertools import count, islice
-from queue import Queue
-from types import (
-    CellType,
-    CodeType,
-    FunctionType,
-    MemberDescriptorType,
-    MethodType,
-    ModuleType,
-    SimpleNamespace,
-)
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -38,22 +18,10 @@ from policy.protocol import PolicyRunner, SingleRatePolicy
 WARM_UP_CALLS = 3
 """Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
 MAX_HELD = 10_000
-"""Largest number of objects that are searched for a policy's modules and memory."""
-_WRAPPERS = (partial, MethodType, CellType, staticmethod, classmethod, property)
-_COLLECTIONS = (list, tuple, dict, set, frozenset, deque, *_WRAPPERS)
-_OPENED = (*_COLLECTIONS, _lru_cache_wrapper, SimpleNamespace, UserDict, Queue, nn.Module)
-"""Types that are searched beside those of packages outside ``_LIBRARIES``; a cached function not
-for its results."""
+"""Largest number of objects that are searched for a policy's modules."""
+_COLLECTIONS = (list, tuple, set, deque)
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
-_OURS = ("policy", "mavbridge")
-_OF_TORCH = frozenset(vars(nn.Module()))
-_OUTSIDE = frozenset(
-    (
-        *("time", "datetime", "io", "_io", "posix", "mmap", "_multiprocessing"),
-        *("_thread", "_queue", "_socket", "select"),
-    )
-)
-"""Modules of Python's own by which a function learns what its arguments do not say."""
+"""Packages whose objects are not searched."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
@@ -145,138 +113,25 @@ class _Graph:
 
 
 def modules_of(policy: object) -> list[nn.Module]:
-    """Return the modules that a policy is or holds, except those inside another module."""
-    modules = [held for _, held, _ in _held_by(policy) if isinstance(held, nn.Module)]
-    inner = {id(child) for module in modules for child in module.modules() if child is not module}
-    return [module for module in modules if id(module) not in inner]
+    """Return the modules that a policy is or holds, except those inside another module.
 
-
-def snapshot(policy: object) -> dict[str, object]:
-    """Return the attributes of a policy and of all that it holds, by name, in a comparable form.
-
-    Tensors are compared by value, except the weights, which no forward call changes; numpy arrays,
-    numbers and texts by value; collections by the identity of their elements; iterators but
-    counters never compare equal; other objects by identity.
+    They are searched in attributes and collections, and in the objects of other classes there.
     """
-    return {
-        path + name: _mark(value)
-        for path, _, inside in _held_by(policy)
-        for name, value in inside.items()
-    }
-
-
-def _held_by(policy: object) -> list[tuple[str, object, dict[str, object]]]:
-    """Return the policy and the modules, collections and objects below it: path, it, attributes."""
-    held, seen = [("", policy, _attributes(policy))], {id(policy)}
-    for path, _, inside in held:  # grows
-        for name, value in inside.items():
-            is_open = isinstance(value, _OPENED) or _is_of_user(type(value)) or _is_code(value)
-            if is_open and id(value) not in seen and len(held) < MAX_HELD:
+    held, seen = [policy], {id(policy)}
+    for each in held:  # grows
+        inside = [*getattr(each, "__dict__", {}).values()]
+        if isinstance(each, dict):
+            inside += each.values()
+        elif isinstance(each, _COLLECTIONS):
+            inside += each
+        elif isinstance(each, partial):
+            inside += [each.func, *each.args, *each.keywords.values()]
+        for value in inside:
+            is_open = isinstance(value, (*_COLLECTIONS, dict, partial, nn.Module))
+            is_foreign = type(value).__module__.partition(".")[0] not in _LIBRARIES
+            if (is_open or is_foreign) and id(value) not in seen and len(held) < MAX_HELD:
                 seen.add(id(value))
-                held.append((path + name, value, _attributes(value)))
-    return held
-
-
-def _is_of_user(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] not in _LIBRARIES
-
-
-def _is_code(value: object) -> bool:
-    """True for a function, class or module of the user's, rather than of an installed package."""
-    if not isinstance(value, FunctionType | type | ModuleType):
-        return False
-    name = str(getattr(value, "__module__", None) or value.__name__)
-    file = getattr(sys.modules.get(name), "__file__", None) or ""
-    is_library = name.partition(".")[0] in (*_LIBRARIES, *_OURS) or "site-packages" in file
-    return not is_library
-
-
-def _reached(function: FunctionType) -> dict[str, object]:
-    """Return the globals, cells and defaults that a function reads or writes, by their names."""
-    codes, names = [function.__code__], set[str]()
-    for code in codes:  # grows by the functions inside
-        names.update(code.co_names)
-        codes += [each for each in code.co_consts if isinstance(each, CodeType)]
-    reached = {name: each for name, each in function.__globals__.items() if name in names}
-    code = function.__code__
-    arguments = reversed(code.co_varnames[: code.co_argcount])
-    reached |= dict(zip(arguments, reversed(function.__defaults__ or ()), strict=False))
-    cells = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
-    return reached | cells | (function.__kwdefaults__ or {})
-
-
-def _attributes(holder: object) -> dict[str, object]:
-    """Return the elements of a collection, and the attributes of an object and of its class."""
-    items: Iterable[tuple[object, object]] = ()
-    if isinstance(holder, _COLLECTIONS):
-        items = holder.items() if isinstance(holder, dict) else enumerate(gc.get_referents(holder))
-    elements = {f"[{key}]": value for key, value in islice(items, MAX_HELD)}
-    attributes = _reached(holder) if isinstance(holder, FunctionType) else {}
-    kinds = holder.__mro__ if isinstance(holder, type) else type(holder).__mro__
-    for kind in filter(_is_of_user, reversed(kinds)):
-        attributes |= vars(kind)
-    slots = [name for name, each in attributes.items() if isinstance(each, MemberDescriptorType)]
-    attributes |= {name: getattr(holder, name, None) for name in slots}
-    attributes |= getattr(holder, "__dict__", {})
-    if isinstance(holder, ModuleType):  # Python itself writes into __warningregistry__
-        attributes = {name: each for name, each in attributes.items() if not name.startswith("__")}
-    if isinstance(holder, nn.Module):
-        is_script = isinstance(holder, torch.jit.ScriptModule)  # holds methods of its original, too
-        attributes = {
-            name: each
-            for name, each in attributes.items()
-            if name not in _OF_TORCH and not (is_script and isinstance(each, MethodType))
-        }
-        attributes |= {**dict(holder.named_buffers(recurse=False)), **dict(holder.named_children())}
-    return elements | {f".{name}": value for name, value in attributes.items()}
-
-
-def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
-    """Return the names, without the path, of attributes that were added, removed or changed."""
-    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return sorted({re.sub(r"\[.*?\]", "", name).rpartition(".")[2] for name in names})
-
-
-@contextmanager
-def outside_calls() -> Iterator[set[str]]:
-    """Context manager: yield the names, complete at its end, of this thread's calls that read a
-    clock, file, socket or lock."""
-    names, before, collects = set[str](), sys.getprofile(), gc.isenabled()
-
-    def note(_frame: object, event: str, called: Any) -> None:
-        if event == "c_call":
-            owner = getattr(called, "__self__", None)
-            kind = owner if isinstance(owner, type) else type(owner)
-            if (getattr(called, "__module__", None) or kind.__module__) in _OUTSIDE:
-                names.add(called.__name__)
-
-    gc.disable()  # a collection would call what is none of the policy's
-    sys.setprofile(note)
-    try:
-        yield names
-    finally:
-        sys.setprofile(before)
-        if collects:
-            gc.enable()
-
-
-def _mark(value: object) -> object:
-    if isinstance(value, Tensor) and value.layout is torch.strided and not value.is_meta:
-        array = value.detach().cpu().contiguous()
-        digest = hashlib.sha256(array.float().numpy().tobytes()).digest()
-        return str(array.dtype), tuple(array.shape), digest
-    if isinstance(value, np.ndarray):
-        return value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).digest()
-    if value is None or isinstance(value, bool | int | str | bytes):
-        return value
-    if isinstance(value, float | count):
-        return repr(value)  # NaN equals itself; a counter tells its next number
-    if isinstance(value, bytearray):
-        return bytes(value)
-    if isinstance(value, dict):
-        return tuple((id(key), id(element)) for key, element in value.items())
-    if isinstance(value, list | tuple | set | frozenset | deque):
-        return tuple(map(id, value))
-    if isinstance(value, Iterator) and not isinstance(value, IOBase):
-        return object()
-    return id(value)
+                held.append(value)
+    modules = [each for each in held if isinstance(each, nn.Module)]
+    children = {id(child) for each in modules for child in each.modules() if child is not each}
+    return [each for each in modules if id(each) not in children]

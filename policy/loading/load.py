@@ -3,7 +3,6 @@
 ``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from dataclasses import replace
@@ -38,6 +37,10 @@ from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
 """Forms of --policy for files of other programs."""
+AS_WRITTEN = (
+    "engine torch: it runs as it is written; if it depends on its inputs and weights alone, "
+    "network.engine=openvino converts it into a faster graph"
+)
 _NOT_PLAIN = (iscoroutinefunction, isgeneratorfunction, isasyncgenfunction)
 """Kinds of functions of which a call runs nothing."""
 Engine = tuple[PolicyRunner, tuple[str, ...]]
@@ -105,11 +108,10 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
     """Find, load, try and time a policy; ``now_s`` (monotonic seconds) also drives programs."""
     check_request(request)
-    threads = frozenset(threading.enumerate())
     policy, notes, make_runner = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
-        settings = replace(_settings(policy, request, notes), threads=threads)
+        settings = _settings(policy, request, notes)
         runner, engine_notes = (make_runner or partial(_on_engine, policy, request))(settings)
         if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)
@@ -152,11 +154,19 @@ def _on_engine(
                 "run: leave it out"
             )
         return make_numpy_runner(policy, settings), ()
+    from policy.adapters.modules import ForwardPolicy
     from policy.engines.choose import choose_runner
+    from policy.engines.torch_engines import modules_of
 
+    kind = request.spec.partition(":")[0]
+    is_ours = kind in (*BUILTIN_KINDS, LEROBOT, TORCHSCRIPT) or isinstance(policy, ForwardPolicy)
+    if request.engine == "auto" and not is_ours:  # methods of the user's own may do anything
+        runner, engine_notes = choose_runner(policy, "torch", settings)
+        if settings.device == "cpu" and modules_of(policy) and not hasattr(policy, "reset"):
+            engine_notes = (AS_WRITTEN,)
+        return runner, engine_notes
     runner, engine_notes = choose_runner(policy, request.engine, settings)
-    is_builtin = request.spec.partition(":")[0] in BUILTIN_KINDS
-    if is_builtin and (request.by_rates or policy.contract.action == "rates"):
+    if kind in BUILTIN_KINDS and (request.by_rates or policy.contract.action == "rates"):
         runner = flown_by_rates(runner)
     return runner, engine_notes
 

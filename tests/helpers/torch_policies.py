@@ -1,12 +1,8 @@
 """Torch policies as a user might write them, small and untrained."""
 
-import itertools
-import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import lru_cache, partial
-from types import ModuleType
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -111,108 +107,14 @@ class ModuleAsMethod(nn.Module):
     predict_fast: Any = TwoRates.predict_fast
 
 
-class Counting(TwoRates):
-    calls = 0
+def changed(change: Callable[[Tensor, Tensor], Tensor]) -> TwoRates:
+    """Return a policy whose chunk is what ``change`` makes of that of another, and of a state."""
 
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        self.calls += 1
-        return super().predict_fast(feature, state, history, steps)
-
-
-class CountingInClass(TwoRates):
-    calls = 0
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        CountingInClass.calls += 1
-        return super().predict_fast(feature, state, history, steps)
-
-
-@dataclass(slots=True)
-class Slotted:
-    calls: int = 0
-
-
-class CountingBy(TwoRates):
-    """Its memory is wherever a function has it."""
-
-    def __init__(self, count: Callable[[], object]) -> None:
-        super().__init__()
-        self.count = count
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        self.count()
-        return super().predict_fast(feature, state, history, steps)
-
-
-COUNTED, MODULE = Slotted(), ModuleType("counted")
-
-
-def count_in_global() -> None:
-    COUNTED.calls += 1
-
-
-def counter_in(held: Any) -> Callable[[], None]:
-    """Return a function whose memory is an attribute of what its closure holds."""
-    is_collection = isinstance(held, list | deque)
-
-    def count() -> None:
-        holder: Any = held[0] if is_collection else held
-        holder.calls = getattr(holder, "calls", 0) + 1
-
-    return count
-
-
-def warn_in_module() -> None:
-    registry = vars(MODULE).setdefault("__warningregistry__", {})
-    registry["version"] = registry.get("version", 0) + 1
-
-
-def count_in_default(calls: list[int] = [0]) -> None:  # noqa: B006 - a usual place for a memory
-    calls[0] += 1
-
-
-def tick(clock: Iterator[int] = itertools.count()) -> None:  # noqa: B008 - another usual place
-    next(clock)
-
-
-@lru_cache(maxsize=0)
-def count_in_cached() -> None:
-    COUNTED.calls += 1
-
-
-class Counter:
-    def __init__(self) -> None:
-        self.calls = 0
-
-    def count(self) -> None:
-        self.calls += 1
-
-
-def changed(base: type[TwoRates], change: Callable[[Tensor, Tensor], Tensor]) -> TwoRates:
-    """Return a policy whose chunk is what ``change`` makes of that of ``base`` and of a state."""
-
-    class Changed(base):  # type: ignore[misc, valid-type]
+    class Changed(TwoRates):
         def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Any:
             return change(super().predict_fast(feature, state, history, steps), state)
 
     return Changed()
-
-
-class ReadingConstants(TwoRates):
-    """Reads a table that it holds beside tensors that it writes, and counts its instances in the
-    class."""
-
-    ids = itertools.count()
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.id, self.gains = next(self.ids), torch.linspace(0.5, 1, 4)
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        gains = torch.zeros(4)
-        gains[1:] = nn.functional.relu(state[:, :3] - state[:, :3], inplace=True)
-        chunk = super().predict_fast(feature, state, history, steps) + gains
-        return chunk * self.gains.split(2)[0][1].item()
 
 
 class Scripted(TwoRates):
@@ -221,23 +123,6 @@ class Scripted(TwoRates):
     def __init__(self) -> None:
         super().__init__()
         self.visual_encoder = torch.jit.script(self.visual_encoder)
-
-
-class Listening(TwoRates):
-    """A thread tells it where to fly."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.goal, self.told = 0.0, threading.Event()
-        self.thread = threading.Thread(target=self.listen, daemon=True)
-        self.thread.start()
-
-    def listen(self) -> None:
-        self.told.wait()
-        self.goal = 0.5
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        return 0.0 * super().predict_fast(feature, state, history, steps) + self.goal
 
 
 class Resetting(TwoRates):

@@ -5,6 +5,7 @@ import json
 import pickle
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torch import nn
 from helpers.loaded_policies import act, load, require_same
 from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser, scripted
 from policy.errors import PolicyError
-from policy.loading.load import check_request, read_policy_contract
+from policy.loading.load import AS_WRITTEN, check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
 
 pytestmark = [
@@ -38,20 +39,35 @@ horizon = 8
         ("NamedDenoiser", False),
         ("Wide", True),
         ("Wide", False),
-        ("TwoRates", True),
-        ("PlainClass", False),
-        ("Scripted", True),
-        ("Listed", True),
-        ("ModuleAsMethod", False),
-        ("ReadingConstants", True),
-        ("Stepwise", True),
-        ("Stepwise", False),
     ],
 )
 def test_a_class_of_torch_modules_flies_converted(name: str, dual_rate: bool) -> None:
     loaded = load(f"{MINE}:{name}", dual_rate=dual_rate, num_diffusion_steps=4)
     assert loaded.runner.engine.startswith("openvino"), loaded.notes
     assert loaded.runner.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
+
+
+@pytest.mark.parametrize(
+    ("name", "dual_rate"),
+    [
+        ("TwoRates", True),
+        ("PlainClass", False),
+        ("Scripted", True),
+        ("Listed", True),
+        ("ModuleAsMethod", False),
+        ("Stepwise", True),
+        ("Stepwise", False),
+    ],
+)
+def test_a_class_with_methods_of_its_own_is_converted_on_request(
+    name: str, dual_rate: bool
+) -> None:
+    flags: Any = {"dual_rate": dual_rate, "num_diffusion_steps": 4}
+    written = load(f"{MINE}:{name}", **flags)
+    assert written.runner.engine == "torch"
+    assert written.notes[-1] == AS_WRITTEN
+    loaded = load(f"{MINE}:{name}", **flags, engine="openvino")
+    assert loaded.runner.engine.startswith("openvino"), loaded.notes
 
 
 def test_modules_that_make_no_policy_are_refused() -> None:

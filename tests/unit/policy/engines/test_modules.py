@@ -2,15 +2,9 @@
 
 import logging
 import re
-import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,20 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from helpers import torch_policies
-from helpers.torch_policies import (
-    Counter,
-    CountingBy,
-    Scripted,
-    Slotted,
-    TwoRates,
-    changed,
-    counter_in,
-    scripted,
-)
+from helpers.torch_policies import TwoRates, changed
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
 from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
-from policy.engines.runner import ExecutionSettings, dummy_sample, encode_all
+from policy.engines.runner import EngineName, ExecutionSettings
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
@@ -54,87 +39,37 @@ def read_where_written(chunk: Tensor, state: Tensor) -> Tensor:
     return chunk * (100 - height[0].item())
 
 
-NEVER, SOURCE, NEWS = datetime.max.replace(tzinfo=UTC), Path(__file__), SimpleQueue[float]()
-DECIDING = [
-    (TwoRates, lambda chunk, state: chunk if state[0, 2] < 100 else -chunk),
-    (TwoRates, lambda chunk, state: chunk * min(state[0, 2], torch.tensor(100.0))),
-    (TwoRates, lambda chunk, state: chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1)),
-    (TwoRates, read_where_written),
-    (Scripted, lambda chunk, state: chunk if state[0, 2] < 100 else -chunk),
-    (Scripted, lambda chunk, state: -chunk if len(state[state[:, 2] > 100]) else chunk),
-    (Scripted, lambda chunk, state: -chunk if len(torch.where(state > 100)[0]) else chunk),
-]
 NO_GRAPHS = [
-    *((partial(changed, *each), "it decides by the values of a tensor") for each in DECIDING),
-    (torch_policies.Counting, "it keeps calls from call to call"),
-    (torch_policies.CountingInClass, "it keeps calls from call to call"),
-    (partial(CountingBy, torch_policies.tick), "it keeps clock from call to call"),
-    (torch_policies.Resetting, "the policy has reset"),
-    *(
-        (partial(changed, TwoRates, change), reason)
-        for change, reason in (
-            (
-                lambda chunk, _: chunk if datetime.now(UTC) < NEVER else -chunk,
-                "it calls now, which",
-            ),
-            (lambda chunk, _: chunk if SOURCE.read_text() else -chunk, "it calls .*open.*read"),
-            (lambda chunk, _: chunk if NEWS.empty() else -chunk, "it calls empty, which a graph"),
-            (
-                lambda chunk, _: chunk + 0.1 * torch.randn_like(chunk),
-                "warning: engine torch: the same inputs do not give the same chunk again",
-            ),
-            (lambda chunk, _: sum([1e-9] * 100, chunk), "its graph has 1.. operations, and at mo"),
-        )
+    (lambda chunk, state: chunk if state[0, 2] < 100 else -chunk, "it decides by the values"),
+    (
+        lambda chunk, state: chunk * torch.tensor(100 - state[0, 2].item()).clamp(0, 1),
+        "it decides by the values of a tensor",
     ),
+    (read_where_written, "it decides by the values of a tensor"),
+    (
+        lambda chunk, _: chunk + 0.1 * torch.randn_like(chunk),
+        "warning: engine torch: the same inputs do not give the same chunk again",
+    ),
+    (lambda chunk, _: sum([1e-9] * 100, chunk), "its graph has 1.. operations, and at mo"),
 ]
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-@pytest.mark.parametrize(("make", "reason"), NO_GRAPHS)
-def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(make, reason, monkeypatch):
+@pytest.mark.parametrize(("change", "reason"), NO_GRAPHS)
+def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(change, reason, monkeypatch):
     monkeypatch.setattr(openvino_modules, "MAX_OPERATIONS", 90)
-    policy, level = make(), logging.root.level
-    runner, notes = choose_runner(policy, "auto", SETTINGS)
+    policy, level = changed(change), logging.root.level
+    runner, notes = choose_runner(policy, "openvino", SETTINGS)
     assert runner.engine == "torch"
     assert logging.root.level == level  # the converter raises it
     assert notes
-    assert all(re.search(reason, note) for note in notes)
+    assert all(re.search(reason, note) for note in notes if note != "engine torch")
 
 
-@pytest.mark.parametrize(
-    "count",
-    [
-        torch_policies.count_in_global,
-        torch_policies.count_in_default,
-        torch_policies.count_in_cached,
-        *map(
-            counter_in, (torch_policies.MODULE, scripted, [SimpleNamespace()], deque([Slotted()]))
-        ),
-        Counter().count,
-        partial(Counter.count, Counter()),
-    ],
-)
-def test_a_memory_behind_functions_is_found(count: Callable[[], object]) -> None:
-    runner, notes = choose_runner(CountingBy(count), "auto", SETTINGS)
+@pytest.mark.parametrize("engine", ["auto", "openvino"])
+def test_a_policy_with_reset_runs_in_torch(engine: EngineName) -> None:
+    runner, (note,) = choose_runner(torch_policies.Resetting(), engine, SETTINGS)
     assert runner.engine == "torch"
-    assert notes == ("engine torch: it keeps calls from call to call, which a graph cannot",)
-
-
-def test_what_a_thread_of_the_policy_tells_it_is_flown() -> None:
-    settings = replace(SETTINGS, threads=frozenset(threading.enumerate()))
-    assert choose_runner(TwoRates(), "auto", settings)[0].engine.startswith("openvino")
-    policy = torch_policies.Listening()
-    runner, notes = choose_runner(policy, "auto", settings)
-    assert notes == ("engine torch: it runs threads, whose news a graph would not see",)
-    policy.told.set()
-    policy.thread.join()
-    images, state, history = dummy_sample(runner.contract)
-    assert (runner.act(encode_all(runner, images), state, history) == 0.5).all()
-
-
-def test_what_python_keeps_in_a_module_is_no_memory() -> None:
-    policy = CountingBy(torch_policies.warn_in_module)
-    assert choose_runner(policy, "auto", SETTINGS)[0].engine.startswith("openvino")
+    assert "the policy has reset" in note
 
 
 def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,10 +83,10 @@ def test_a_second_start_converts_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
     for _ in range(2):
         choose_runner(TwoRates(), "auto", SETTINGS)
         assert len(converted) == 2
-    changed = TwoRates()
+    other = TwoRates()
     with torch.no_grad():
-        changed.head.layers[0].bias[0] += 1  # type: ignore[union-attr, operator]
-    assert choose_runner(changed, "auto", SETTINGS)[0].engine.startswith("openvino")
+        other.head.layers[0].bias[0] += 1  # type: ignore[union-attr, operator]
+    assert choose_runner(other, "auto", SETTINGS)[0].engine.startswith("openvino")
     assert len(converted) == 3  # the encoder is the same
 
 
@@ -204,7 +139,7 @@ def one_bad_stick(chunk: FloatArray) -> FloatArray:
 def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason):
     runner, notes = first_that_agrees(small_toge, [altered(small_toge, alter)], SETTINGS)
     assert runner.engine == "torch"
-    assert len(notes) == 1
+    assert notes[1:] == ("engine torch",)
     assert notes[0].startswith("warning: engine wrong is passed over: ")
     assert re.search(reason, notes[0])
 
