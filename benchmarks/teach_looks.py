@@ -34,7 +34,7 @@ from mavbridge.simulation.flight import SIM_CAMERA_PX, SimulatedFlight
 from mavbridge.simulation.world import make_vehicle
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import Contract, FloatArray
-from policy.nets.toge import BuiltinConfig, Toge
+from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import fit_image
 from policy.training.batches import disturb, normalise_image
 from policy.training.run import GRADIENT_LIMIT, computing_in, update_average, uses_bf16
@@ -218,7 +218,7 @@ def loss_of(net: Toge, batch: list[Tensor]) -> Tensor:
 
 def load_toge(path: Path) -> Toge:
     """Read the weights of a TOGE; raise CheckpointError for those of another network."""
-    policy = load_checkpoint(path, fallback=BuiltinConfig())
+    policy = load_checkpoint(path, fallback=TogeConfig())
     assert isinstance(policy, Toge), "load_checkpoint refuses another kind than its fallback's"
     return policy
 

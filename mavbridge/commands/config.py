@@ -42,7 +42,7 @@ class ExportPolicyConfig:
     out: Path
     """Folder for encoder.onnx, denoiser.onnx and policy.json."""
     policy: str = "toge"
-    """Kind of the policy: toge or resnet-unet."""
+    """toge[:small|medium|large][:BACKBONE]."""
 
 
 @Parameter(name="*")

@@ -93,7 +93,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     console = text_console(stderr=True)
     kind = config.policy.partition(":")[0]
     if kind not in BUILTIN_KINDS:
-        raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
+        raise UserError(f"--policy {config.policy}: policies of toge are exported")
     ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
     require_packages("export-policy", "onnx")
     if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):

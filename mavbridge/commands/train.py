@@ -20,7 +20,7 @@ from policy.data.lerobot_format import is_lerobot
 from policy.engines.runner import require_device
 from policy.loading.builtin import builtin_config
 from policy.motion.stick_loop import rates_contract
-from policy.nets.toge import BuiltinConfig
+from policy.nets.toge import TogeConfig
 from policy.nets.world_model.config import WorldModelConfig
 from policy.training.policy_run import train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
@@ -61,8 +61,8 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 
 
 def fit_to_flights(
-    network: BuiltinConfig, flights: Sequence[FlightData], settings: TrainSettings
-) -> BuiltinConfig:
+    network: TogeConfig, flights: Sequence[FlightData], settings: TrainSettings
+) -> TogeConfig:
     """Return the network with the flights' frame and actions, and the settings' inputs."""
     flown = common_contract(flights)
     contract = replace(

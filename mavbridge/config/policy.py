@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from mavbridge.config.flags import POLICY, RARE, RATES, Ranged, hidden
 from policy.fields import Between
+from policy.nets.names import BUILTIN_KINDS
 
 STEPS, TOGE_STEPS = 10, 1
 """DDIM steps by default, and those of toge and toge-rates, which fly as well in one
@@ -71,16 +72,11 @@ class PolicyConfig(Ranged):
         return self.policy.partition(":")[0]
 
     @property
-    def may_be_dual(self) -> bool:
-        """True if the policy may fly at two rates, as far as is known before it is loaded."""
-        return self.dual_rate is not False and self.kind != "resnet-unet"
-
-    @property
     def steps(self) -> int:
         """DDIM steps from noise."""
         if self.num_diffusion_steps is not None:
             return self.num_diffusion_steps
-        return TOGE_STEPS if self.kind in ("toge", "toge-rates") else STEPS
+        return TOGE_STEPS if self.kind in BUILTIN_KINDS else STEPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,14 +13,14 @@ from policy.adapters.description import DENOISER, DESCRIPTION, ENCODER
 from policy.contract import ACTION_DIM
 from policy.engines.openvino_modules import Traceable
 from policy.nets.diffusion import SIZE_DIMS
-from policy.nets.toge import BuiltinPolicy
+from policy.nets.toge import Toge
 
 OPSET = 18
 """ONNX operator set, from 2022: every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 
 
-def export_onnx(policy: BuiltinPolicy, folder: Path) -> None:
+def export_onnx(policy: Toge, folder: Path) -> None:
     """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
     contract = policy.contract
     image = torch.zeros(1, 3, contract.image_height, contract.image_width)

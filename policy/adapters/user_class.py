@@ -24,7 +24,7 @@ from policy.files import stand_in, user_path
 from policy.protocol import DualRatePolicy, SingleRatePolicy, predict_by_pair
 
 FORMS = (
-    "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
+    "toge[:SIZE][:BACKBONE], scripted[:PROGRAM][:ACTION][:air], "
     "lerobot:DIR, onnx:DIR_OR_FILE, torchscript:FILE, ws://HOST:PORT, package.module:Class or "
     "./file.py:Class"
 )

@@ -44,16 +44,16 @@ from policy.engines.choose import ParitySamples, make_parity_samples, parity_fai
 from policy.errors import CheckpointError, PolicyError
 from policy.files import parse_object, why_unreadable
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
+from policy.nets.toge import Toge, TogeConfig
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.preprocess import image_to_input
 
-Config = TypeVar("Config", bound=BuiltinConfig | WorldModelConfig)
+Config = TypeVar("Config", bound=TogeConfig | WorldModelConfig)
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
-KIND_KEY = "policy"
-"""Name of ``BuiltinConfig.kind`` in a header."""
+KIND_KEY, KIND = "policy", "toge"
+"""Entry of an architecture, and its only value."""
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
 VECTOR_STEPS = 10
 """Denoising steps of a test vector, or all if the schedule has fewer; its noise has seed 0."""
@@ -70,7 +70,7 @@ WORLD_MODEL_KEY = "world_model"
 
 
 def save_checkpoint(
-    path: Path, policy: BuiltinPolicy, *, training: str = "{}", packed: bool = False
+    path: Path, policy: Toge, *, training: str = "{}", packed: bool = False
 ) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` atomically.
 
@@ -86,31 +86,30 @@ def save_checkpoint(
         policy.load_state_dict(unpack(state))
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
-    architecture = config_json(policy.config)
+    architecture = config_json(policy.config, **{KIND_KEY: KIND})
     contract = policy.contract.to_json()
     header = {CONTRACT_KEY: contract, ARCHITECTURE_KEY: architecture, TRAINING_KEY: training}
     write_tensors(path, state, header)
 
 
-def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
+def load_checkpoint(path: Path, *, fallback: TogeConfig) -> Toge:
     """Read a checkpoint into its network, on the CPU, in eval mode.
 
-    ``fallback`` is the requested policy: the file must be of its kind, and its values supply
-    everything that a ``.pt`` lacks.
+    ``fallback`` is the requested policy: its values supply everything that a ``.pt`` lacks.
     """
     require_file(path, SUFFIXES)
     config, vector = fallback, {}
     if path.suffix == ".safetensors":
         header, tensors = read_tensors(path)
         require_header(path, header)
-        config = _config_of(path, header, ARCHITECTURE_KEY, BuiltinConfig, kind=fallback.kind)
+        config = _config_of(path, header, ARCHITECTURE_KEY, TogeConfig)
         ours = [name for name in tensors if name.startswith(VECTOR_PREFIX)]
         vector = {name.removeprefix(VECTOR_PREFIX): tensors.pop(name) for name in ours}
         state = unpack(tensors)
     else:
         state = _read_torch(path)
     policy = load_fitting(
-        *(path, partial(build_policy, config), state),
+        *(path, partial(Toge, config), state),
         "Name the size and encoder of its training, as in --policy toge:medium:resnet18, or save "
         "the network's own state_dict()",
     )
@@ -119,7 +118,7 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     return policy
 
 
-def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
+def _make_vector(policy: Toge) -> dict[str, Tensor]:
     """Return inputs, and the chunks that plain torch computes from them in float32 on a CPU."""
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
@@ -130,7 +129,7 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
 
 
 @torch.inference_mode()
-def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
+def _chunks(policy: Toge, samples: ParitySamples) -> FloatArray:
     policy.head.seed_noise(0)
     images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in samples.rgb])
     steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
@@ -139,7 +138,7 @@ def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
     return chunks
 
 
-def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Tensor]) -> None:
+def _require_reproduced(path: Path, policy: Toge, vector: dict[str, Tensor]) -> None:
     damaged = f"{path}: its test vector is damaged"
     if set(vector) != set(VECTOR_NAMES):
         raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
@@ -162,25 +161,21 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def config_json(config: BuiltinConfig | WorldModelConfig) -> str:
+def config_json(config: TogeConfig | WorldModelConfig, **more: str) -> str:
     """Return the header form of a configuration: without the contract, which has its own entry."""
-    data = {KIND_KEY if name == "kind" else name: value for name, value in asdict(config).items()}
+    data = asdict(config) | more
     del data["contract"]
     return json.dumps(data, sort_keys=True)
 
 
-def _config_of(
-    path: Path, header: dict[str, str], key: str, wanted: type[Config], kind: str | None = None
-) -> Config:
-    """Return the configuration under ``key`` of a file's header, of this kind if there are any."""
+def _config_of(path: Path, header: dict[str, str], key: str, wanted: type[Config]) -> Config:
+    """Return the configuration under ``key`` of a file's header."""
     text = header[key]
     try:
         contract = Contract.from_json(header[CONTRACT_KEY])
         data = parse_object(text, CheckpointError, f"malformed {key}: it")
-        if kind is not None:
-            if (found := data.pop(KIND_KEY, None)) != kind:
-                raise CheckpointError(f"it holds a {found}, no {kind}: fly it by --policy {found}")
-            data["kind"] = kind
+        if (found := data.pop(KIND_KEY, KIND)) != KIND:
+            raise CheckpointError(f"it holds a {found}, which is no network of ours")
         return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error

@@ -27,7 +27,7 @@ from policy.engines.torch_engines import (
     modules_of,
 )
 from policy.errors import Agreed, NoChunkError, PolicyError, warned
-from policy.nets.toge import BuiltinPolicy
+from policy.nets.toge import Toge
 from policy.preprocess import SINCE_EXPOSURE_SCALE
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
@@ -124,7 +124,7 @@ def choose_runner(
             f"network.engine={engine} takes a torch.nn.Module, or a class that holds one as an "
             f"attribute: leave it out, and {settings.name} runs on torch"
         )
-    if not isinstance(policy, BuiltinPolicy):
+    if not isinstance(policy, Toge):
         if engine == "auto" and settings.device != "cpu":
             return make_torch_runner(policy, settings), ()
         if hasattr(policy, "reset"):

@@ -34,8 +34,8 @@ from policy.engines.runner import (
 )
 from policy.engines.torch_engines import modules_of, run_eagerly
 from policy.errors import PolicyError, user_code
-from policy.nets.toge import BuiltinPolicy
-from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
+from policy.nets.toge import Toge
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
@@ -65,9 +65,7 @@ def make_module_runner(
 
     A short solve of a built-in network is one graph: half the time of a graph for each step.
     """
-    unrolls = isinstance(policy, BuiltinPolicy) and settings.num_diffusion_steps <= MAX_UNROLLED
-    if not unrolls and isinstance(policy, BuiltinPolicy) and not isinstance(policy, StepwisePolicy):
-        raise PolicyError(f"more than {MAX_UNROLLED} steps are too many for one graph")
+    unrolls = isinstance(policy, Toge) and settings.num_diffusion_steps <= MAX_UNROLLED
 
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
@@ -88,7 +86,7 @@ class ModuleConverter:
         self._name = settings.name
         self._known = ""
         """Content of all graphs of a built-in network."""
-        if isinstance(policy, BuiltinPolicy):
+        if isinstance(policy, Toge):
             digest = hashlib.sha256()
             noise = {"noise": policy.head.initial_noise}
             for name, value in [*policy.state_dict().items(), *noise.items()]:

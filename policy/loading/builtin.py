@@ -1,4 +1,4 @@
-"""Built-in networks: TOGE and ResNet-UNet, trained or with random weights."""
+"""The built-in network: TOGE, trained or with random weights."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +9,7 @@ from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, BUILTIN_KINDS, SIZE_NAMES, BackboneName, Size
 
 if TYPE_CHECKING:
-    from policy.nets.toge import BuiltinConfig, BuiltinPolicy
+    from policy.nets.toge import Toge, TogeConfig
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Default weights of ``toge``; its model card is beside it."""
@@ -17,35 +17,33 @@ SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
 """Default weights of ``toge-rates``, which flies by thrust and body rates."""
 
 
-def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
+def builtin_config(spec: str, *, image_size: int | None) -> "TogeConfig":
     """Return the built-in network of ``spec``, with the default contract at that image size."""
-    from policy.nets.toge import BuiltinConfig
+    from policy.nets.toge import TogeConfig
 
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
-            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE]; a world model "
+            "has a command of its own, train-world-model"
         )
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
-    if kind == "resnet-unet":
-        return BuiltinConfig(kind="resnet-unet", size=size, backbone="resnet18", contract=contract)
-    return BuiltinConfig(size=size, backbone=backbone or BuiltinConfig.backbone, contract=contract)
+    return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
 
 
-def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
+def load_builtin(request: PolicyRequest) -> tuple["Toge", list[str]]:
     """Build a network and load its weights, or seeded random ones; return notes too."""
     import torch
 
-    from policy.nets.toge import build_policy
+    from policy.nets.toge import Toge
 
     config = builtin_config(request.spec, image_size=request.image_size)
     if (checkpoint := builtin_checkpoint(request)) is not None:
         return _trained(config, request.spec.split(":")[1:], checkpoint, request.seed)
     with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
         torch.manual_seed(request.seed)
-        policy = build_policy(config).eval()
+        policy = Toge(config).eval()
     policy.head.seed_noise(request.seed)
     note = f"untrained: seeded random weights (seed {request.seed}, noise too); for bring-up only"
     return policy, [note]
@@ -74,7 +72,7 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
     """Return the size and backbone of a spec; a checkpoint's own values take precedence."""
     rest: list[Any] = list(options)
     size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
-    if len(rest) > (0 if kind == "resnet-unet" else 1):
+    if len(rest) > 1:
         raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
     if rest and rest[0] not in BACKBONE_NAMES:
         raise PolicyError(
@@ -85,8 +83,8 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
 
 
 def _trained(
-    config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
-) -> tuple["BuiltinPolicy", list[str]]:
+    config: "TogeConfig", options: list[str], checkpoint: Path, seed: int
+) -> tuple["Toge", list[str]]:
     from policy.checkpoints.networks import load_checkpoint
 
     policy = load_checkpoint(checkpoint, fallback=config)

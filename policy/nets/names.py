@@ -2,8 +2,7 @@
 
 from typing import Literal, get_args
 
-BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
-Network = Literal["toge", "resnet-unet"]
+BUILTIN_KINDS = ("toge", "toge-rates")
 
 Size = Literal["small", "medium", "large"]
 SIZE_NAMES: tuple[Size, ...] = get_args(Size)

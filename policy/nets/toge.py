@@ -18,7 +18,7 @@ from policy.errors import ContractError, PolicyError
 from policy.fields import require_fields
 from policy.nets.attention import Attention, is_tracing
 from policy.nets.diffusion import SIZE_DIMS, DiffusionHead, NoiseSchedule
-from policy.nets.names import BackboneName, Network, Size
+from policy.nets.names import BackboneName, Size
 from policy.nets.resnet import build_backbone
 from policy.preprocess import egocentric_columns, egocentric_scale
 
@@ -111,11 +111,9 @@ class Fusion(nn.Module):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuiltinConfig:
+class TogeConfig:
     """Architecture settings."""
 
-    kind: Network = "toge"
-    """Name of the network in --policy and in checkpoints."""
     size: Size = "small"
     backbone: BackboneName = "resnet8"
     contract: Contract = field(default_factory=Contract)
@@ -124,40 +122,39 @@ class BuiltinConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Width of the cached feature; 0 for the network without a fast path."""
-        return SIZE_DIMS[self.size].base_dim if self.kind == "toge" else 0
+        """Width of the cached feature."""
+        return SIZE_DIMS[self.size].base_dim
 
     def __post_init__(self) -> None:
         require_fields(self, PolicyError)
         if self.contract.feature_dim not in (0, self.feature_dim):
             raise ContractError(
-                f"the contract says feature_dim {self.contract.feature_dim}, but {self.kind} "
-                f"{self.size} has {self.feature_dim}: choose the size of the checkpoint"
+                f"the contract says feature_dim {self.contract.feature_dim}, but toge {self.size} "
+                f"has {self.feature_dim}: choose the size of the checkpoint"
             )
         if self.contract.arrays != "torch":
             raise ContractError(
-                f"{self.kind} takes torch arrays, the contract says {self.contract.arrays}"
+                f"toge takes torch arrays, the contract says {self.contract.arrays}"
             )
         if self.contract.prefix_len:
-            raise ContractError(f"{self.kind} takes no prefix: leave prefix_len out")
+            raise ContractError("toge takes no prefix: leave prefix_len out")
         if self.schedule.prediction != "sample":
-            raise PolicyError(f"the schedule of {self.kind} must predict the sample")
+            raise PolicyError("the schedule of toge must predict the sample")
 
 
-class BuiltinPolicy(nn.Module):
-    """Network behind ``protocol.SingleRatePolicy``, on torch tensors.
+class Toge(nn.Module):
+    """TOGE behind ``protocol.StepwisePolicy``, on torch tensors.
 
     Images are normalised by ``preprocess.image_to_input``, states are in SI units. Steps that the
     schedule does not have raise a ``PolicyError``. Chunks are sticks, even if the contract says
     rates: ``policy.motion.stick_loop`` converts them.
     """
 
-    head: DiffusionHead
-
-    def __init__(self, config: BuiltinConfig) -> None:
+    def __init__(self, config: TogeConfig) -> None:
+        """Build the network with random weights from torch's global generator."""
         super().__init__()
-        dim = SIZE_DIMS[config.size].base_dim
-        self.contract = replace(config.contract, feature_dim=config.feature_dim)
+        dim = config.feature_dim
+        self.contract = replace(config.contract, feature_dim=dim)
         self.config = replace(config, contract=self.contract)
         self.backbone = build_backbone(config.backbone)
         # The norm scales every backbone's feature like the other tokens.
@@ -165,10 +162,19 @@ class BuiltinPolicy(nn.Module):
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
         self.state_encoder = StateEncoder(dim, self.contract)
+        self.history_encoder = HistoryEncoder(dim // 4, self.contract.history_len)
+        self.fusion = Fusion(dim, self.history_encoder.out_dim)
+        self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
         """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
-        raise NotImplementedError
+        condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
+        return condition
+
+    def encode_visual(self, image: Tensor) -> Tensor:
+        """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
+        feature: Tensor = self.visual_projection(self.backbone(image))
+        return feature
 
     def denoise(
         self,
@@ -182,45 +188,19 @@ class BuiltinPolicy(nn.Module):
         condition = self.condition(feature, self.state_encoder(state), action_history)
         return self.head.denoise(noisy, timestep, condition)
 
-    def _encode(self, image: Tensor) -> Tensor:
-        feature: Tensor = self.visual_projection(self.backbone(image))
-        return feature
-
-    def _sample(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        condition = self.condition(feature, self.state_encoder(state), history)
-        return self.head.sample(condition, steps)
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+    ) -> Tensor:
+        """Sample a chunk [B, horizon, 4] in [-1, 1] from feature, state and history."""
+        condition = self.condition(feature, self.state_encoder(state), action_history)
+        return self.head.sample(condition, num_diffusion_steps)
 
     def predict(
         self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
-        """Sample a chunk [B, horizon, 4] in [-1, 1] from image, state and history."""
-        return self._sample(self._encode(image), state, action_history, num_diffusion_steps)
-
-
-class Toge(BuiltinPolicy):
-    """TOGE behind ``protocol.StepwisePolicy``."""
-
-    def __init__(self, config: BuiltinConfig) -> None:
-        super().__init__(config)
-        dim = config.feature_dim
-        self.history_encoder = HistoryEncoder(dim // 4, self.contract.history_len)
-        self.fusion = Fusion(dim, self.history_encoder.out_dim)
-        self.head = DiffusionHead(config.size, self.contract, config.schedule)
-
-    def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
-        condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
-        return condition
-
-    def encode_visual(self, image: Tensor) -> Tensor:
-        """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
-        return self._encode(image)
-
-    def predict_fast(
-        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
-    ) -> Tensor:
-        """Sample a chunk from a cached feature: bit-identical to ``predict`` on its image."""
-        return self._sample(feature, state, action_history, num_diffusion_steps)
+        """Sample a chunk as ``predict_fast``, from an image."""
+        feature = self.encode_visual(image)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
 
     @property
     def schedule(self) -> NoiseSchedule:
@@ -235,28 +215,3 @@ class Toge(BuiltinPolicy):
     def to_chunk(self, sample: Tensor) -> Tensor:
         """Return the end of a solve as it is."""
         return sample
-
-
-class ResnetUnet(BuiltinPolicy):
-    """Plain diffusion policy without a fast path."""
-
-    def __init__(self, config: BuiltinConfig) -> None:
-        super().__init__(config)
-        dim = SIZE_DIMS[config.size].base_dim
-        history_dim = self.contract.history_len * ACTION_DIM
-        self.fuse = nn.Sequential(
-            nn.Linear(2 * dim + history_dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim)
-        )
-        self.head = DiffusionHead(config.size, self.contract, config.schedule)
-
-    def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
-        condition: Tensor = self.fuse(
-            torch.cat([feature, state_token, action_history.flatten(1)], dim=1)
-        )
-        return condition
-
-
-def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
-    """Build the network of ``config``, with random weights from torch's global generator."""
-    return Toge(config) if config.kind == "toge" else ResnetUnet(config)

@@ -17,7 +17,7 @@ from policy.data.flight_folders import read_ages
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
 from policy.errors import PolicyError
-from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
+from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import (
     ENCODE_BATCH,
     Batch,
@@ -43,7 +43,7 @@ HEAD_RATE = 3
 
 
 def train_policy(
-    flights: Sequence[FlightData], network: BuiltinConfig, settings: TrainSettings, hooks: Hooks
+    flights: Sequence[FlightData], network: TogeConfig, settings: TrainSettings, hooks: Hooks
 ) -> TrainResult:
     """Train, and write the weights that are best on held-out flights to ``settings.out``."""
     with work_folder(settings) as folder:
@@ -56,7 +56,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        network: BuiltinConfig,
+        network: TogeConfig,
         settings: TrainSettings,
         hooks: Hooks,
         folder: Path,
@@ -176,17 +176,17 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
     return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
-def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Trainee:
+def _starting_trainee(network: TogeConfig, settings: TrainSettings) -> Trainee:
     """Return the policy to start from with a new gate head; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
             weight = 0.0 if settings.only_end else settings.gate_weight
             return Trainee(_checkpoint(network, settings.start_from), weight)
-        return Trainee(build_policy(network), settings.gate_weight)
+        return Trainee(Toge(network), settings.gate_weight)
 
 
-def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
+def _checkpoint(network: TogeConfig, path: Path) -> Toge:
     policy = load_checkpoint(path, fallback=network)
     old, new = policy.contract, network.contract
     if old.action != new.action or not set(old.modes) & set(new.modes):

@@ -94,7 +94,7 @@ class TrainSettings(RunSettings):
     """Settings of the training of a policy."""
 
     policy: str = "toge"
-    """toge[:small|medium|large][:BACKBONE] or resnet-unet[:SIZE]."""
+    """toge[:small|medium|large][:BACKBONE]."""
     since_exposure: bool = True
     """Give the policy its image's age and the motion since; --no-since-exposure to leave it out."""
     ages: str | None = None

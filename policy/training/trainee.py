@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.diffusion import SIZE_DIMS
-from policy.nets.toge import BuiltinPolicy
+from policy.nets.toge import Toge
 from policy.training.batches import Batch, StepLoss, normalised
 from policy.training.report import PolicyValidation
 
@@ -34,7 +34,7 @@ VALIDATION_STEPS = 10
 class Trainee(nn.Module):
     """Policy with its gate head, and the mean and spread of the sticks to imitate."""
 
-    def __init__(self, policy: BuiltinPolicy, gate_weight: float) -> None:
+    def __init__(self, policy: Toge, gate_weight: float) -> None:
         super().__init__()
         self.policy = policy
         self.gate_head = nn.Linear(SIZE_DIMS[policy.config.size].base_dim, GATE_LABELS)

@@ -10,9 +10,9 @@ from safetensors.torch import save
 from policy.checkpoints.networks import load_checkpoint
 from policy.contract import Contract
 from policy.errors import CheckpointError
-from policy.nets.toge import BuiltinConfig
+from policy.nets.toge import TogeConfig
 
-FALLBACK = BuiltinConfig(
+FALLBACK = TogeConfig(
     backbone="resnet18", contract=Contract(image_height=32, image_width=32, horizon=4)
 )
 

@@ -43,20 +43,17 @@ def test_a_number_out_of_range_is_refused_by_its_name(config: type[Ranged], fiel
 
 
 @pytest.mark.parametrize(
-    ("changes", "is_dual", "steps"),
+    ("changes", "steps"),
     [
-        ({}, True, 1),
-        ({"policy": "toge:medium"}, True, 1),
-        ({"dual_rate": False}, False, 1),
-        ({"policy": "resnet-unet"}, False, 10),
-        ({"policy": "toge-rates"}, True, 1),
-        ({"policy": "toge-rates", "num_diffusion_steps": 4}, True, 4),
-        ({"policy": "./mine.py:Mine"}, True, 10),
+        ({}, 1),
+        ({"policy": "toge:medium"}, 1),
+        ({"policy": "toge-rates"}, 1),
+        ({"policy": "toge-rates", "num_diffusion_steps": 4}, 4),
+        ({"policy": "./mine.py:Mine"}, 10),
     ],
 )
-def test_defaults(changes: dict[str, Any], is_dual: bool, steps: int) -> None:
-    config = PolicyConfig(**changes)
-    assert (config.may_be_dual, config.steps) == (is_dual, steps)
+def test_default_steps(changes: dict[str, Any], steps: int) -> None:
+    assert PolicyConfig(**changes).steps == steps
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
         require_images(config)
 
 
-@pytest.mark.parametrize("policy", ["toge", "toge:medium", "resnet-unet"])
+@pytest.mark.parametrize("policy", ["toge", "toge:medium"])
 def test_a_net_of_ours_is_not_flown_without_a_camera(policy: str) -> None:
     blind = CameraConfig(camera=("none",))
     with pytest.raises(UserError, match="name a camera"):

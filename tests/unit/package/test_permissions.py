@@ -10,11 +10,11 @@ import pytest
 from helpers.rollouts import TINY
 from policy.checkpoints.networks import save_checkpoint, save_world_model
 from policy.contract import Contract
-from policy.nets.toge import BuiltinConfig, Toge
+from policy.nets.toge import Toge, TogeConfig
 from policy.nets.world_model.model import WorldModel
 
 UMASK = 0o027
-SMALL = BuiltinConfig(backbone="resnet8", contract=Contract(image_height=32, image_width=32))
+SMALL = TogeConfig(backbone="resnet8", contract=Contract(image_height=32, image_width=32))
 
 
 @pytest.mark.parametrize(

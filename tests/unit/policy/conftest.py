@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from policy.checkpoints.networks import BuiltinPolicy, load_checkpoint
+from policy.checkpoints.networks import load_checkpoint
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
-from policy.nets.toge import BuiltinConfig, Toge
+from policy.nets.toge import Toge, TogeConfig
 
 
 @pytest.fixture(scope="session")
@@ -13,10 +13,10 @@ def small_toge() -> Toge:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         contract = Contract(image_height=32, image_width=32)
-        return Toge(BuiltinConfig(backbone="resnet8", contract=contract)).eval()
+        return Toge(TogeConfig(backbone="resnet8", contract=contract)).eval()
 
 
 @pytest.fixture(scope="session")
-def trained_toge() -> BuiltinPolicy:
+def trained_toge() -> Toge:
     """The shipped policy."""
-    return load_checkpoint(SHIPPED, fallback=BuiltinConfig())
+    return load_checkpoint(SHIPPED, fallback=TogeConfig())

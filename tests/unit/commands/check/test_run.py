@@ -51,7 +51,7 @@ def test_no_vehicle_is_a_no_go_in_status_table_and_json(
 
 
 def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str]) -> None:
-    check(CheckConfig(timing=0.5, flight=flight("resnet-unet:nonsense"), json=Path("-")))
+    check(CheckConfig(timing=0.5, flight=flight("toge:nonsense"), json=Path("-")))
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
     assert "name a camera" in rows["cameras"]["advice"]
     assert rows["policy"]["verdict"] == "no-go", "a policy that cannot be loaded is a row"

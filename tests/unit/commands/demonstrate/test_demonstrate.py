@@ -25,7 +25,7 @@ from mavbridge.recording.video_writer import WriterDiedError
 from mavbridge.simulation.referee import EpisodeInterruptedError
 from policy.data.flight_folders import read_flight
 from policy.loading.builtin import SHIPPED, SHIPPED_RATES
-from policy.nets.toge import BuiltinConfig
+from policy.nets.toge import TogeConfig
 from policy.training.settings import TrainSettings
 
 SIZE = 48
@@ -292,7 +292,7 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     assert (data.contract.action, data.contract.hover_thrust) == ("rates", 0.39)
     assert 0.1 < np.abs(data.target).max() <= 1.0
     assert not data.sent.any()
-    network = fit_to_flights(BuiltinConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))
+    network = fit_to_flights(TogeConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))
     assert (network.contract.action, network.contract.max_tilt_deg) == ("rates", 80.0)
     assert network.contract.stops_at_end
     assert network.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")

@@ -19,7 +19,7 @@ from policy.data.flight_folders import read_flight, read_flights
 from policy.loading.builtin import SHIPPED
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
-from policy.nets.toge import BuiltinConfig
+from policy.nets.toge import TogeConfig
 from policy.training.report import TrainingProgress
 from policy.training.settings import TrainSettings
 
@@ -127,7 +127,7 @@ def test_the_policy_takes_frame_and_sticks_of_the_flights(tmp_path: Path) -> Non
     sticks = {"modes": ["LOITER"], "full_lean_deg": 45.0, "throttle_dead_zone": 0.0}
     write_meta(folder, contract={"state_frame": "enu_flu", **sticks})
     settings = TrainSettings(out=tmp_path / "a.safetensors", since_exposure=False)
-    network = BuiltinConfig(backbone="resnet8", contract=Contract(since_exposure=True))
+    network = TogeConfig(backbone="resnet8", contract=Contract(since_exposure=True))
     made = run.fit_to_flights(network, [read_flight(folder)], settings)
     assert made.contract.state_frame == "enu_flu"
     assert made.contract.modes == ("LOITER",)

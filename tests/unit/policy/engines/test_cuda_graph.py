@@ -15,7 +15,7 @@ from policy.engines.choose import (
 )
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_engines import make_cuda_graph_runner, make_torch_runner
-from policy.nets.toge import BuiltinConfig, BuiltinPolicy, Toge
+from policy.nets.toge import Toge, TogeConfig
 
 pytestmark = [
     pytest.mark.gpu,
@@ -27,9 +27,9 @@ ON_GPU = ExecutionSettings(name="toge", device="cuda")
 
 
 @pytest.mark.parametrize("size", ["shipped", "large"])
-def test_the_graph_computes_what_torch_computes(trained_toge: BuiltinPolicy, size: str) -> None:
+def test_the_graph_computes_what_torch_computes(trained_toge: Toge, size: str) -> None:
     torch.manual_seed(0)
-    large = BuiltinConfig(size="large", contract=SMALL)
+    large = TogeConfig(size="large", contract=SMALL)
     policy = trained_toge if size == "shipped" else Toge(large).eval()
     samples, plain = make_parity_samples(policy.contract), ExecutionSettings(name="t")
     expected = chunks_of_samples(make_torch_runner(policy, plain), samples)

@@ -26,23 +26,23 @@ from policy.engines.runner import ExecutionSettings, Precision
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
+from policy.nets.toge import Toge, TogeConfig
 from policy.protocol import PolicyRunner
 
 SMALL = Contract(image_height=32, image_width=32)
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
 
 
-def seeded(config: BuiltinConfig) -> BuiltinPolicy:
+def seeded(config: TogeConfig) -> Toge:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        policy = build_policy(config).eval()
+        policy = Toge(config).eval()
     policy.head.seed_noise(3)
     return policy
 
 
 def converted(
-    policy: BuiltinPolicy,
+    policy: Toge,
     settings: ExecutionSettings,
     vision: Precision = "f32",
     action: Precision = "f32",
@@ -51,7 +51,7 @@ def converted(
     return make_module_runner(converter, policy, settings, vision, action)
 
 
-def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
+def both(policy: Toge, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
     """Chunks by plain torch, and by OpenVINO in float32."""
     samples = make_parity_samples(policy.contract)
     reference = make_torch_runner(policy, settings)
@@ -60,7 +60,7 @@ def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray
     return chunks_of_samples(reference, samples), chunks_of_samples(runner, samples)
 
 
-OTHER = BuiltinConfig(
+OTHER = TogeConfig(
     backbone="resnet18",
     contract=Contract(image_height=32, image_width=48, horizon=8, history_len=2),
     schedule=NoiseSchedule(betas="linear", num_train_timesteps=50),
@@ -70,11 +70,11 @@ OTHER = BuiltinConfig(
 @pytest.mark.parametrize(
     ("config", "steps"),
     [
-        (BuiltinConfig(kind="resnet-unet", contract=replace(SMALL, since_exposure=True)), 1),
+        (TogeConfig(backbone="resnet18", contract=replace(SMALL, since_exposure=True)), 1),
         (OTHER, MAX_UNROLLED + 1),
     ],
 )
-def test_single_rate_computes_what_torch_computes(config: BuiltinConfig, steps: int) -> None:
+def test_single_rate_computes_what_torch_computes(config: TogeConfig, steps: int) -> None:
     settings = ExecutionSettings(name="toge", num_diffusion_steps=steps, dual_rate=False)
     expected, chunks = both(seeded(config), settings)
     assert np.abs(expected).max() > 0.1
@@ -103,7 +103,7 @@ def cached(folder: Path) -> list[Path]:
 
 def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    policy = seeded(BuiltinConfig(backbone="resnet8", contract=SMALL))
+    policy = seeded(TogeConfig(backbone="resnet8", contract=SMALL))
     samples = make_parity_samples(SMALL)
 
     def chunks(seed: int = 0) -> FloatArray:

@@ -4,10 +4,9 @@ from torch import Tensor
 
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.nets.names import BACKBONE_NAMES, BackboneName, Network
+from policy.nets.names import BACKBONE_NAMES, BackboneName
 from policy.nets.resnet import build_backbone
-from policy.nets.toge import BuiltinConfig, build_policy
-from policy.protocol import DualRatePolicy
+from policy.nets.toge import Toge, TogeConfig
 
 
 def sample() -> tuple[Tensor, Tensor, Tensor]:
@@ -19,13 +18,11 @@ def sample() -> tuple[Tensor, Tensor, Tensor]:
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("kind", ["toge", "resnet-unet"])
-def test_every_input_reaches_the_sticks(kind: Network) -> None:
+def test_every_input_reaches_the_sticks() -> None:
     torch.manual_seed(0)
     image, state, history = sample()
     contract = Contract(image_height=32, image_width=32, since_exposure=True)
-    policy = build_policy(BuiltinConfig(kind=kind, backbone="resnet18", contract=contract)).eval()
-    assert isinstance(policy, DualRatePolicy) == (kind == "toge")
+    policy = Toge(TogeConfig(backbone="resnet18", contract=contract)).eval()
     wide = torch.cat([state, torch.zeros(1, 7)], dim=1)
     chunk = policy.predict(image, wide, history, 2)
     assert not torch.equal(policy.predict(-image, wide, history, 2), chunk)
@@ -40,17 +37,17 @@ def test_every_input_reaches_the_sticks(kind: Network) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "changes", "message"),
+    ("changes", "message"),
     [
-        ("toge", {"arrays": "numpy"}, "torch"),
-        ("resnet-unet", {"feature_dim": 256}, "resnet-unet small has 0"),
-        ("toge", {"horizon": 10}, "multiple of 4"),
-        ("toge", {"cameras": ("left", "right")}, "a policy class of your own"),
+        ({"arrays": "numpy"}, "torch"),
+        ({"feature_dim": 12}, "toge small has 256"),
+        ({"horizon": 10}, "multiple of 4"),
+        ({"cameras": ("left", "right")}, "a policy class of your own"),
     ],
 )
-def test_a_contract_of_another_network_is_refused(kind, changes, message):
+def test_a_contract_of_another_network_is_refused(changes, message):
     with pytest.raises(PolicyError, match=message):
-        build_policy(BuiltinConfig(kind=kind, contract=Contract(**changes)))
+        Toge(TogeConfig(contract=Contract(**changes)))
 
 
 @pytest.mark.parametrize("name", BACKBONE_NAMES)

@@ -21,7 +21,7 @@ from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
 from policy.errors import PolicyError
-from policy.nets.toge import BuiltinConfig, Toge, build_policy
+from policy.nets.toge import Toge, TogeConfig
 from policy.training import batches as batches_module
 from policy.training.batches import SHARE, Batches, colour_matrix, disturb
 from policy.training.policy_run import train_policy
@@ -33,7 +33,7 @@ from policy.training.trainee import Trainee, gate_labels, gate_loss
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CONTRACT = Contract(image_height=32, image_width=32, horizon=4, since_exposure=True)
-NETWORK = BuiltinConfig(backbone="resnet8", contract=CONTRACT)
+NETWORK = TogeConfig(backbone="resnet8", contract=CONTRACT)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def run(
     flights: list[FlightData],
     settings: TrainSettings,
     report: Callable[[TrainingProgress], None] = lambda _: None,
-    network: BuiltinConfig = NETWORK,
+    network: TogeConfig = NETWORK,
 ) -> TrainResult:
     return train_policy(flights, network, settings, make_hooks(report))
 
@@ -153,12 +153,11 @@ def test_images_of_several_proportions_are_told(flights, tmp_path):
     assert "width by height" not in noted([other], asked)[1]
 
 
-def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
-    network = BuiltinConfig(kind="resnet-unet", contract=CONTRACT)
+def test_it_trains_without_gates_and_packed(flights, tmp_path):
     changes = {"gate_weight": 0.0, "mirror": False, "validations": 1, "steps": 2, "pack": True}
-    result = run(flights[:2], settings(tmp_path, **changes), network=network)
-    assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
-    weights = sum(p.numel() for p in build_policy(network).parameters())
+    result = run(flights[:2], settings(tmp_path, **changes))
+    assert load_checkpoint(result.checkpoint, fallback=NETWORK).contract.horizon == CONTRACT.horizon
+    weights = sum(p.numel() for p in Toge(NETWORK).parameters())
     assert result.checkpoint.stat().st_size < 2 * weights
 
 
@@ -185,7 +184,7 @@ def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_p
     assert "head.unet.out.weight" in [name for name in before if before[name] == after[name]]
     trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
     assert terms == {name: getattr(trained, name) for name in terms}
-    other = BuiltinConfig(backbone="resnet50", contract=CONTRACT)
+    other = TogeConfig(backbone="resnet50", contract=CONTRACT)
     refused = replace(further, out=tmp_path / "refused.safetensors")
     with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
         run(flights[:2], refused, network=other)
