@@ -3,12 +3,12 @@ intervals."""
 
 import hashlib
 import math
+import statistics
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 
-import numpy as np
 from rich.console import Console
 
 from mavbridge.commands.episode_workers import fly_jobs
@@ -37,10 +37,6 @@ from policy.files import read_json
 
 Z95 = 1.959963984540054
 """95 % of a normal distribution are within this many standard deviations."""
-_BLOCKS, _BLOCK = 100, 100
-"""10,000 resamples, one block at a time."""
-_SEED = 0
-"""Seed of the resampling, so that equal flights have equal intervals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +175,6 @@ def evaluate(config: EvaluateConfig) -> int:
         try:
             with closing(_fly(config, console, dict(flown), stop.is_set)) as episodes:
                 for index, episode in episodes:
-                    if config.resume and (engine := _engine(flown)) not in ("", episode.engine):
-                        raise UserError(
-                            f"--resume: the flights before were flown by the engine {engine}, "
-                            f"here it is {episode.engine}: go on where they were flown, or name "
-                            "another --json"
-                        )
                     flown[index] = episode
                     if config.resume:
                         write_json(config.json, as_document(config, flown, flown_by))
@@ -248,19 +238,14 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
-    """Return the mean with a percentile bootstrap interval (B. Efron 1979); None without values."""
+    """Return the mean with the interval of its standard error; None without values."""
     if not values:
         return None
-    sample = np.asarray(values, dtype=np.float64)
-    low = high = None
-    if len(sample) > 1:
-        random = np.random.Generator(np.random.PCG64(_SEED))
-        size = (_BLOCK, len(sample))
-        means = [
-            sample[random.integers(len(sample), size=size)].mean(axis=1) for _ in range(_BLOCKS)
-        ]
-        low, high = (float(bound) for bound in np.percentile(means, (2.5, 97.5)))
-    return Estimate(value=float(sample.mean()), low=low, high=high, count=len(sample))
+    value, low, high = statistics.fmean(values), None, None
+    if len(values) > 1:
+        half = Z95 * statistics.stdev(values) / math.sqrt(len(values))
+        low, high = value - half, value + half
+    return Estimate(value=value, low=low, high=high, count=len(values))
 
 
 FIGURES = {

@@ -24,7 +24,6 @@ class Flights:
     def __init__(self) -> None:
         self.flown: list[int] = []
         self.fails_at: int | None = None
-        self.engine = "numpy"
         self.path: Path | None = None
         self.on_disk: list[int] = []
         """Flights in the file at ``path`` as each one ends."""
@@ -41,7 +40,7 @@ class Flights:
             distance_m=30.0 + spec.index,
             lost=because(Code.TOO_SLOW, chunks=5, age_ms=9.5, limit_ms=5.0) if spec.index else None,
         )
-        return FlownEpisode(engine=self.engine, result=result)
+        return FlownEpisode(engine="numpy", result=result)
 
 
 @pytest.fixture
@@ -136,15 +135,6 @@ def test_flights_by_other_flags_or_weights_are_not_mixed(
     weights.write_text("another")
     with pytest.raises(UserError, match="other flags, weights or versions"):
         evaluate(config)
-
-
-def test_flights_of_another_engine_are_not_mixed(flights: Flights, config: EvaluateConfig) -> None:
-    evaluate(config)
-    before = config.json.read_text()
-    flights.engine = "torch"
-    with pytest.raises(UserError, match="flown by the engine numpy, here it is torch"):
-        evaluate(replace(config, episodes=6))
-    assert json.loads(config.json.read_text())["episodes"] == json.loads(before)["episodes"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"flown_by": 1, "engine": "", "episodes": [{}]}'])
