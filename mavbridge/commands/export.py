@@ -4,7 +4,6 @@ A row holds the data known at the exposure of its image: the newest state measur
 the newest sticks to imitate up to then. Nothing is interpolated; the stamps give the age of each.
 """
 
-import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from itertools import chain, groupby, islice, pairwise
 from pathlib import Path
 from shutil import rmtree
+from statistics import median_low
 
 import numpy as np
 from av.error import FFmpegError
@@ -22,6 +22,7 @@ from mavbridge.commands.export_dataset import MIN_ROWS, DatasetWriter
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.contract import ACTION_DIM, STICK_TERMS
@@ -42,7 +43,7 @@ MAX_MISSING_FRAMES = 1
 """Longest run of missing frames. After a longer one a new episode begins, because LeRobot assumes
 rows at equal intervals."""
 MAX_RATE_OFF = 0.2
-"""Largest relative difference between a flight's and the common rate, or that and an integer."""
+"""Largest relative difference between a flight's rate and the common one."""
 
 
 @dataclass(frozen=True)
@@ -112,26 +113,22 @@ def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[i
 
 def common_fps(parts: Sequence[Stretch]) -> int:
     """Return the integer frame rate that LeRobot assumes for all frames, or raise UserError."""
-    common = _rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))
-    fps = max(1, round(common))
-    if abs(common / fps - 1.0) > MAX_RATE_OFF:
-        raise UserError(
-            f"these flights have {common:.3g} frames a second, and a LeRobot dataset must have a "
-            f"whole number: record at {fps} images a second, or use --format mcap"
-        )
     # Per flight, because a stretch of a few frames has no rate of its own.
-    for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
-        whole = list(of_flight)
-        own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
-        if abs(own / common - 1.0) > MAX_RATE_OFF:
+    flights = [list(each) for _, each in groupby(parts, key=lambda part: id(part.episode))]
+    rates_hz = {flight[0].episode.name: _rate_hz(flight) for flight in flights}
+    fps = max(1, round(median_low(rates_hz.values())))
+    for name, own_hz in rates_hz.items():
+        if abs(own_hz / fps - 1.0) > MAX_RATE_OFF:
             raise UserError(
-                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest "
-                f"{common:.3g}: a LeRobot dataset has one rate, so export them apart"
+                f"{name} has {own_hz:.3g} frames a second, and a LeRobot dataset one whole number "
+                f"for all its flights, here {fps}: export it apart, record at {fps}, or use "
+                "--format mcap"
             )
     return fps
 
 
-def _rate_hz(periods_ns: Nanoseconds) -> float:
+def _rate_hz(parts: Sequence[Stretch]) -> float:
+    periods_ns = np.concatenate([np.diff(part.captured_ns) for part in parts])
     whole = periods_ns[periods_ns <= 1.5 * np.median(periods_ns)]
     return NS_PER_S / float(np.maximum(whole.mean(), 1.0))
 
@@ -226,36 +223,23 @@ def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[Imag
 
 @contextmanager
 def whole_or_nothing(out: Path) -> Iterator[Path]:
-    """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
+    """Context manager: a folder in ``out`` whose contents move to ``out`` when it is complete.
 
-    An empty folder that is there may be a mounted one, which is not replaced: it gets the contents.
-    SIGTERM ends the block as Ctrl-C does, and no folder stays. Raises UserError if ``out`` is
-    taken.
+    ``out`` is new or empty, perhaps a mounted folder. SIGTERM ends the block as Ctrl-C does, and
+    nothing stays. Raises UserError if ``out`` is taken or cannot be written.
     """
-    place = Path(os.path.realpath(out))
-    try:
-        is_new = not place.exists()
-        part = place.with_name(f"{place.name}.unfinished") if is_new else place / ".unfinished"
-        if part.exists():
-            raise UserError(
-                f"{part} is left of an export that was killed, or another one is at work there: "
-                "remove it, or name another --out"
-            )
-        if not is_new and (not place.is_dir() or any(place.iterdir())):
-            raise UserError(f"--out {out} is there and not empty: name a new folder")
-        part.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
+    part = out / ".unfinished"
     terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield part
-        if is_new:
-            part.rename(place)
-        else:
+    with empty_folders_removed(out):
+        try:
+            if out.exists() and (not out.is_dir() or any(out.iterdir())):
+                raise UserError(f"--out {out} is there and not empty: name a new folder")
+            part.mkdir(parents=True)
+            yield part
             for entry in list(part.iterdir()):
-                entry.rename(place / entry.name)
-    except (OSError, FFmpegError) as error:
-        raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
-    finally:
-        rmtree(part, ignore_errors=True)
-        signal.signal(signal.SIGTERM, terminate)
+                entry.rename(out / entry.name)
+        except (OSError, FFmpegError) as error:
+            raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
+        finally:
+            rmtree(part, ignore_errors=True)
+            signal.signal(signal.SIGTERM, terminate)

@@ -224,8 +224,8 @@ def _other_clock(root: Path) -> None:
     ("prepare", "says"),
     [
         (_flights({}, {"size": 64}), "images of 64x64"),
-        (_flights({}, {"period_ms": 66}), "export them apart"),
-        (_flights({"period_ms": 640, "frames": 5}), "have 1.56 frames a second"),
+        (_flights({}, {"period_ms": 66}), "here 15: export it apart"),
+        (_flights({"period_ms": 640, "frames": 5}), "has 1.56 frames a second"),
         (_flights({}, {"contract": {"state_frame": "enu_flu"}}), "one kind at a time"),
         (
             _flights({}, {"contract": {"state_frame": "ned_frd", "yaw_dead_zone": 0.0}}),
