@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
-from mavbridge.core.records import Event, Tick, VisionTick
+from mavbridge.core.records import Event, Tick
 from mavbridge.core.switch import Position, Switch
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.observers import flight_meta
@@ -20,7 +20,6 @@ from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
-from mavbridge.recording.video_process import ring_of
 
 QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
 KEYS = (QUIT_KEY, TOGGLE_KEY, " ", GOOD_KEY, BAD_KEY)
@@ -153,9 +152,6 @@ class Episode:
     log: PacketPipe
     recorder: Recorder
     mark: Mark | None = None
-    has_writer: bool = False
-    """True once the writer process runs, which takes 0.7 to 1.6 s on two shared cores."""
-    _waiting: deque[VisionTick] = field(default_factory=deque)
     _first: dict[type[Event], int] = field(default_factory=dict)
     """Number of the first recorded tick, and of the first frame."""
 
@@ -174,24 +170,7 @@ class Episode:
         return None if crash is None else f"a crash ({crash})"
 
     def emit(self, event: Event) -> None:
-        """Record events since the start of the episode, numbered from there.
-
-        Of the images that wait for the writer process, the newest are kept that it can take at
-        once: none may be missing behind them.
-        """
-        at_ns = event.woke_ns if isinstance(event, Tick) else event.captured_ns
-        if at_ns < self.begin_ns:
-            return
-        if isinstance(event, Tick):
-            self._record(event)
-            return
-        self._waiting.append(event)
-        if not self.has_writer and len(self._waiting) > ring_of(event.rgb).slots // 2:
-            self._waiting.popleft()
-        while self.has_writer and self._waiting:
-            self._record(self._waiting.popleft())
-
-    def _record(self, event: Event) -> None:
+        """Record an event, numbered from the first of the episode."""
         first = self._first.setdefault(type(event), event.serial)
         self.recorder.emit(replace(event, serial=event.serial - first))
 
@@ -216,8 +195,6 @@ class Episodes:
         self._autopilot = autopilot
         self._report = report
         self._log_lock = threading.Lock()
-        self._recorded: Episode | None = None
-        """Episode that takes events: the current one, and before that while its recorder begins."""
         self.current: Episode | None = None
         self._last: Episode | None = None
         self._marks: dict[int, bool | None] = {}
@@ -225,7 +202,7 @@ class Episodes:
 
     def emit(self, event: Event) -> None:
         """Record the event if an episode is in progress; a ``TickSink``."""
-        if (episode := self._recorded) is not None:
+        if (episode := self.current) is not None:
             episode.emit(event)
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
@@ -246,25 +223,22 @@ class Episodes:
         return Counter(self._marks.values())
 
     def begin(self) -> None:
-        """Begin an episode.
+        """Begin an episode once its writer process runs: 0.7 to 1.6 s on two shared cores.
 
         Raises:
             UserError, WriterError: its folder cannot be written, or its writer does not start.
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder, "--out")
-        begin_ns, offset_ns = self._clock.now_ns(), wall_offset_ns(self._clock)
+        start_ns, offset_ns = self._clock.now_ns(), wall_offset_ns(self._clock)
         recorder = Recorder()
         try:
             pipe = open_tlog_pipe()
             log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=offset_ns)
             pipe.writer.close()
-            episode = self._recorded = Episode(
-                folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
-            )
             recorder.begin(
                 folder,
-                flight_meta(self._plan, "pilot", begin_ns, offset_ns),
+                flight_meta(self._plan, "pilot", start_ns, offset_ns),
                 tlog_pipe=pipe,
                 packets_dropped=lambda: log.dropped,
                 autopilot=self._autopilot,
@@ -272,13 +246,18 @@ class Episodes:
             )
         except OSError as error:
             raise UserError(f"{folder}: {error}") from error
-        episode.has_writer = True
-        self.current = episode
+        self.current = Episode(
+            folder=folder,
+            number=self._next,
+            begin_ns=self._clock.now_ns(),
+            log=log,
+            recorder=recorder,
+        )
         self._next += 1
 
     def end(self, reason: str) -> None:
         """End the current episode, mark it, and report its contents."""
-        episode, self.current, self._recorded = self.current, None, None
+        episode, self.current = self.current, None
         if episode is None:
             return
         seconds = (self._clock.now_ns() - episode.begin_ns) / NS_PER_S

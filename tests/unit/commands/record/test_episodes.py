@@ -15,7 +15,6 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.recorder import Recorder
-from mavbridge.recording.video_process import MAX_SLOTS
 from mavbridge.recording.video_writer import WriterDiedError
 
 PACKET = bytes(20)
@@ -76,39 +75,22 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
     assert stand.episodes.counts.total() == 2
 
 
-def test_what_was_before_the_begin_is_left_out(stand: Stand) -> None:
-    stand.episodes.begin()
-    begin_ns = make_tick(0).woke_ns
-    stand.episodes.emit(make_tick(3, woke_ns=begin_ns - 1))
-    stand.episodes.emit(make_frame(3, captured_ns=begin_ns - 1))
-    stand.episodes.emit(make_tick(4))
-    stand.episodes.emit(make_frame(4, captured_ns=begin_ns))
-    stand.episodes.end("a key")
-    assert (stand.flight(1).meta.ticks, stand.flight(1).meta.frames) == (1, 1)
-
-
-def test_what_comes_while_the_writer_starts_is_recorded(
+def test_an_episode_begins_when_its_writer_runs(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of the images the newest: a hole behind the first of them would cut the episode in two."""
     begin = Recorder.begin
 
     def begin_late(*args: object, **kwargs: object) -> None:
-        for number in range(100, 140):
-            stand.episodes.emit(make_tick(number))
-            stand.episodes.emit(make_frame(number))
+        stand.episodes.emit(make_tick(3))
+        stand.episodes.emit(make_frame(3))
         begin(*args, **kwargs)
 
     monkeypatch.setattr(Recorder, "begin", begin_late)
-    stand.episodes.begin()
-    stand.episodes.emit(make_tick(140))
-    stand.episodes.emit(make_frame(140))
-    stand.episodes.end("a key")
-    flight = stand.flight(1)
-    assert [row.tick.index for row in flight.tick_rows()] == list(range(100, 141))
-    frame_ids = [row.frame_id for row in flight.frame_rows()]
-    assert frame_ids == [make_frame(number).frame_id for number in range(140 - MAX_SLOTS // 2, 141)]
-    assert flight.meta.frames_dropped == 0
+    stand.record(4)
+    assert [row.tick.index for row in stand.flight(1).tick_rows()] == [4, 5, 6]
+    assert [row.frame_id for row in stand.flight(1).frame_rows()] == [
+        make_frame(number).frame_id for number in (4, 5, 6)
+    ]
 
 
 @pytest.mark.parametrize(("mark", "success"), [("good", True), ("bad", False)])
