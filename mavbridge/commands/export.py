@@ -229,17 +229,21 @@ def whole_or_nothing(out: Path) -> Iterator[Path]:
     nothing stays. Raises UserError if ``out`` is taken or cannot be written.
     """
     part = out / ".unfinished"
-    terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     with empty_folders_removed(out):
         try:
             if out.exists() and (not out.is_dir() or any(out.iterdir())):
-                raise UserError(f"--out {out} is there and not empty: name a new folder")
+                raise UserError(
+                    f"--out {out} is there and not empty (an export that was killed leaves "
+                    f"{part.name}): name a new folder, or empty it"
+                )
             part.mkdir(parents=True)
-            yield part
-            for entry in list(part.iterdir()):
-                entry.rename(out / entry.name)
+            terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
+            try:
+                yield part
+                for entry in list(part.iterdir()):
+                    entry.rename(out / entry.name)
+            finally:
+                rmtree(part, ignore_errors=True)
+                signal.signal(signal.SIGTERM, terminate)
         except (OSError, FFmpegError) as error:
             raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
-        finally:
-            rmtree(part, ignore_errors=True)
-            signal.signal(signal.SIGTERM, terminate)

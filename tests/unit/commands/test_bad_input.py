@@ -193,7 +193,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_meta(two, contract=asdict(Contract(cameras=("down", "front"))))
     write_meta(folder / "foreign", format="something else")
     (folder / "empty").mkdir()
-    (folder / "left.unfinished").mkdir()
+    (folder / "left/.unfinished").mkdir(parents=True)
     (folder / "folder.safetensors").mkdir()
     for name, text in (
         ("act/config.json", b"{}"),
