@@ -187,8 +187,6 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
     add("--connect", action="append", metavar="LINK", help=connect_help)
-    onboard_help = "such a link for a companion computer: PX4 gives it other streams"
-    add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
     add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")
@@ -241,8 +239,8 @@ def _add_course_flags(parser: argparse.ArgumentParser) -> None:
 
 def _fly(args: argparse.Namespace) -> None:
     """Fly until the end or a signal, fly on without links or pilot, then write the report."""
-    links, onboard = args.connect or [], args.connect_onboard or []
-    if not links + onboard:
+    urls = args.connect or []
+    if not urls:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
     if args.pilot and (args.rc_in or args.receiver):
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
@@ -252,10 +250,9 @@ def _fly(args: argparse.Namespace) -> None:
             args.report.open("a").close()
             if is_new:
                 args.report.unlink()
-    config, course = _config(args, len(links), len(onboard)), make_course(args.course, args.laps)
+    config, course = _config(args), make_course(args.course, args.laps)
     clock = Clock()
     with ExitStack() as stack:
-        urls = links + onboard
         transports = [stack.enter_context(closing(open_transport(url, clock))) for url in urls]
         vehicle = SimulatedVehicle(
             links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
@@ -295,12 +292,11 @@ def _writing(report: Path) -> Iterator[None]:
         raise UsageError(f"--report {report}: {error.strerror}; name another file") from error
 
 
-def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig:
+def _config(args: argparse.Namespace) -> VehicleConfig:
     has_receiver = args.autopilot != "px4" or args.pilot
     receiver = args.receiver or ("mid" if has_receiver else "none")
     return VehicleConfig(
         autopilot=args.autopilot,
-        onboard_links=frozenset(range(links, links + onboard)),
         receiver_us=RECEIVERS[receiver],
         signing=args.signing_key_file and _signing_key(args.signing_key_file),
     )

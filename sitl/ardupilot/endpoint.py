@@ -1,9 +1,8 @@
 """One link of an ArduPilot vehicle: its messages and their intervals.
 
-As in the firmware, intervals are rounded and capped, with at most ten distinct values. Units and
-oddities are those measured on ArduCopter 4.7: scaled integers in RAW_IMU, a HIGHRES_IMU whose gyro
-keeps its bias and whose magnetometer is a million times too large, positions withheld until the
-estimator has one.
+As in the firmware, intervals are rounded and capped. Units and oddities are those measured on
+ArduCopter 4.7: a magnetometer in HIGHRES_IMU that is a million times too large, positions withheld
+until the estimator has one.
 """
 
 import numpy as np
@@ -12,11 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
-from sitl.clock import NS_PER_MS, NS_PER_S, NS_PER_US, next_slot_ns
+from sitl.clock import NS_PER_MS, NS_PER_US, next_slot_ns
 from sitl.link.server import Endpoint, Stream
 from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
-from sitl.vehicle.rotation import Vec3, plus
 
 _SENSORS = flags(
     "MAV_SYS_STATUS_",
@@ -34,8 +32,6 @@ _EKF_HORIZONTAL = flags(
 )
 _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: velocity and acceleration only
 _POSITION_ONLY = 3576  # type_mask: position only
-GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
-"""Gyro bias. The estimator subtracts it; raw IMU messages contain it."""
 
 
 class ArduPilotTelemetry(Telemetry[ArduCopter]):
@@ -51,10 +47,6 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
         "SET_POSITION_TARGET_LOCAL_NED",
     )
     """Without FTP, so that clients fetch parameters with PARAM_REQUEST_LIST."""
-
-    @property
-    def gyro_radps(self) -> Vec3:
-        return plus(self.ap.sensed.rate_body_radps, GYRO_BIAS_RADPS)
 
     @property
     def version(self) -> int:
@@ -81,15 +73,6 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
         if ap.radio_failsafe.active:
             faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
         return self._health(present=present, enabled=present, healthy=present & ~faults)
-
-    def raw_imu(self) -> Fields:
-        """Scaled integers in spite of the name."""
-        _, *imu, temperature_cdeg = self.scaled_imu()
-        return (self.boot_us, *imu, 0, temperature_cdeg)
-
-    def scaled_imu2(self) -> Fields:
-        """The second IMU agrees with the first."""
-        return self.scaled_imu()
 
     def local_position_ned(self) -> Fields | None:
         if not self.ap.position_ready:
@@ -138,16 +121,12 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
 HEARTBEAT_INTERVAL_MS = 1000
 SHORTEST_INTERVAL_MS = 3  # 1 / (0.8 * SCHED_LOOP_RATE) in whole milliseconds, at 400 Hz
 MAX_INTERVAL_US = 60_000_000
-MAX_DISTINCT_INTERVALS = 10
-TIMESYNC_PERIOD_NS = 10 * NS_PER_S
-PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
     getattr(mav, f"MAV_DATA_STREAM_{group}"): tuple(
         getattr(mav, f"MAVLINK_MSG_ID_{name}") for name in names.split()
     )
     for group, names in (
-        ("RAW_SENSORS", "RAW_IMU SCALED_IMU2"),
         ("EXTENDED_STATUS", "SYS_STATUS"),
         ("RC_CHANNELS", "RC_CHANNELS"),
         ("POSITION", "GLOBAL_POSITION_INT LOCAL_POSITION_NED"),
@@ -158,25 +137,13 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
 
 
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
-    """Link whose message intervals, in whole ms, are shared by all of its senders.
-
-    MESSAGE_INTERVAL reports the interval without the conditions' delays (slow link, jitter,
-    phases), as the firmware does.
-    """
+    """Link whose message intervals, in whole ms, are shared by all of its senders."""
 
     def __init__(self, ap: ArduCopter) -> None:
         super().__init__(ap, ArduPilotTelemetry(ap))
         self._conditions = ap.config.conditions
         self._random = np.random.Generator(np.random.PCG64((self._conditions.seed, 5)))
         self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS)
-        self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
-
-    def step(self, now_ns: int) -> None:
-        super().step(now_ns)
-        if self._ap.now_ns >= self._timesync_due_ns:
-            self._timesync_due_ns += TIMESYNC_PERIOD_NS
-            uptime_ns = self._ap.uptime_ns
-            self.send(mav.MAVLink_timesync_message(0, uptime_ns + self._ap.system_id))
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
@@ -205,17 +172,12 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
             for message_id in STREAM_GROUPS.get(one, ()):
                 self._start(message_id, interval_ms)
 
-    def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
-        return super().interval_us(message_id) if message_id in self._telemetry.names else 0
-
     def _due(self) -> list[int]:
         """Return the ids of the messages to send now; after missed slots, each is sent once."""
         now_ns, ready = self._ap.now_ns, []
-        slowdown = PARAM_SLOWDOWN if self._queued_params else 1
         for message_id, stream in self._streams.items():
             if now_ns >= stream.due_ns + stream.late_ns:
-                period_ns = self._period_ns(stream.interval_us) * slowdown
+                period_ns = self._period_ns(stream.interval_us)
                 stream.due_ns = next_slot_ns(stream.due_ns, period_ns, now_ns)
                 stream.late_ns = self._random_ns(self._conditions.stream_jitter_ms * NS_PER_MS)
                 ready.append(message_id)
@@ -230,10 +192,6 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
     def _start(self, message_id: int, interval_ms: int) -> None:
         self._streams.pop(message_id, None)
         if interval_ms > 0:
-            # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
-            taken_ms = {stream.interval_us // 1000 for stream in self._streams.values()}
-            if interval_ms not in taken_ms and len(taken_ms) >= MAX_DISTINCT_INTERVALS:
-                interval_ms = min(taken_ms, key=lambda other: abs(other - interval_ms))
             period_ns = self._period_ns(interval_ms * 1000)
             early_ns = self._random_ns(self._conditions.stream_phase_spread * period_ns)
             due_ns = self._ap.now_ns + period_ns - early_ns

@@ -14,11 +14,9 @@ from sitl.vehicle.firmware import Held, Receiver
 
 STICKS = ("ROLL", "PITCH", "THROTTLE", "YAW")
 CHANNELS = 16
-PRIMARY_CHANNELS = 8  # 0 and the highest values mean something else on channels 9-16
+OVERRIDDEN_CHANNELS = 8  # overrides of channels 9-16 are ignored
 IGNORE = 65535
-RELEASE_ON_AUX = 65534  # releases channels 9-16; an ordinary value on 1-8
-RELEASE = 0  # releases channels 1-8; means "ignore" on 9-16
-AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
+RELEASE = 0
 
 DEBOUNCE_NS = NS_PER_S // 5
 _OPTION_OVERRIDE_SWITCH = 46
@@ -56,33 +54,17 @@ class RcEngine:
 
     @property
     def channel_count(self) -> int:
-        return max(PRIMARY_CHANNELS, len(self._receiver.channels_us or ()))
+        return max(OVERRIDDEN_CHANNELS, len(self._receiver.channels_us or ()))
 
     def override(self, raw_us: Sequence[int], now_ns: int) -> None:
-        """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
-        for index, value in enumerate(raw_us[:CHANNELS]):
-            is_primary = index < PRIMARY_CHANNELS
-            if value == RELEASE_ON_AUX and not is_primary:
-                self._set(index, RELEASE, now_ns)
-            elif value != IGNORE and (is_primary or value != RELEASE):
-                self._set(index, value, now_ns)
-
-    def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
-        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward and so a lower PWM."""
-        if z < 0:
+        """Apply one RC_CHANNELS_OVERRIDE."""
+        if not self._takes_overrides:
             return
-        axes = (
-            ("ROLL", y, y + 1000, 2000),
-            ("PITCH", x, 1000 - x, 2000),
-            ("YAW", r, r + 1000, 2000),
-            ("THROTTLE", z, z, 1000),
-        )
-        for axis, value, travel, full in axes:
-            index = self.index_of(axis)
-            low = self._params.integer(f"RC{index + 1}_MIN")
-            high = self._params.integer(f"RC{index + 1}_MAX")
-            pwm = low + (high - low) * travel // full & 0xFFFF  # stored without a range check
-            self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
+        for index, value in enumerate(raw_us[:OVERRIDDEN_CHANNELS]):
+            if value != IGNORE:
+                self._override_us[index] = value
+                self._override_ns[index] = now_ns
+                self._fresh_override = self._was_overridden = True
 
     def clear_overrides(self) -> None:
         self._override_us = [RELEASE] * CHANNELS
@@ -124,13 +106,6 @@ class RcEngine:
         if receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
             return None
         return receiver_us[index] if index < len(receiver_us) else 0
-
-    def _set(self, index: int, value_us: int, now_ns: int) -> None:
-        if not self._takes_overrides:
-            return
-        self._override_us[index] = value_us
-        self._override_ns[index] = now_ns
-        self._fresh_override = self._was_overridden = True
 
     def _watch_switch(self, now_ns: int) -> None:
         """Read the override switch: high allows overrides, low forbids them, the middle changes

@@ -13,18 +13,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
+from sitl.ardupilot.rc import IGNORE, OVERRIDDEN_CHANNELS, RELEASE
 from sitl.link.server import (
     ACCEPTED,
-    COMMAND_FIELDS,
     DENIED,
     FAILED,
     FORCE,
     UNSUPPORTED,
     MavlinkServer,
     Params7,
-    rc_values_us,
-    send_ack,
 )
 from sitl.link.telemetry import Message
 from sitl.report import FlightLog
@@ -68,7 +65,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         # Commands mark unused parameters with NaN; each handler checks those that it reads.
         values = [getattr(message, name) for name in message.fieldnames]
         numbers = [value for value in values if isinstance(value, float)]
-        if message.get_type() not in COMMAND_FIELDS and not all(map(math.isfinite, numbers)):
+        if message.get_type() != "COMMAND_LONG" and not all(map(math.isfinite, numbers)):
             self._log.refused_messages += 1
             return False
         return True
@@ -86,22 +83,12 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if not self._is_from_gcs(message):
             return
         self._ap.gcs_failsafe.on_contact(self._arrived_ns)
-        raw_us = rc_values_us(message)
-        primary = set(raw_us[:PRIMARY_CHANNELS])
-        if primary - {RELEASE, IGNORE}:
+        raw_us = [getattr(message, f"chan{n + 1}_raw") for n in range(OVERRIDDEN_CHANNELS)]
+        if set(raw_us) - {RELEASE, IGNORE}:
             self._log.overrides.add(self._arrived_ns)
-        elif RELEASE in primary:
+        elif RELEASE in raw_us:
             self._log.releases += 1
         self._ap.rc.override(raw_us, self._arrived_ns)
-
-    def on_manual_control(self, _link: ArduPilotEndpoint, message: Message) -> None:
-        if message.target != self._ap.system_id or not self._is_from_gcs(message):
-            return
-        self._ap.gcs_failsafe.on_contact(self._arrived_ns)
-        self._log.manual_controls.add(self._arrived_ns)
-        self._ap.rc.manual_control(
-            x=message.x, y=message.y, z=message.z, r=message.r, now_ns=self._arrived_ns
-        )
 
     def on_set_attitude_target(self, _link: ArduPilotEndpoint, message: Message) -> None:
         ap = self._ap
@@ -126,32 +113,19 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.follow_velocity(setpoint, ap.sensed, self._arrived_ns)
             self._log.setpoints.add(self._arrived_ns)
 
-    def on_set_mode(self, link: ArduPilotEndpoint, message: Message) -> None:
-        result = self.cmd_do_set_mode((message.base_mode, message.custom_mode), link)
-        send_ack(link, message, mav.MAVLINK_MSG_ID_SET_MODE, result)
-
     def on_request_data_stream(self, link: ArduPilotEndpoint, message: Message) -> None:
         rate_hz = message.req_message_rate if message.start_stop else 0
         link.set_group(message.req_stream_id, rate_hz)
 
-    def _to_mode(self, number: float) -> int:
+    def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        is_finite = all(map(math.isfinite, params[:2]))
+        if not is_finite or not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return DENIED
         try:
-            mode = Mode(int(number))
+            mode = Mode(int(params[1]))
         except ValueError:
             return FAILED
         return ACCEPTED if self._ap.set_mode(mode) else FAILED
-
-    def cmd_nav_return_to_launch(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
-        return self._to_mode(Mode.RTL)
-
-    def cmd_nav_land(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
-        return self._to_mode(Mode.LAND)
-
-    def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
-        is_finite = all(map(math.isfinite, params[:2]))
-        if is_finite and int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            return self._to_mode(params[1])
-        return DENIED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if params[0] not in (0.0, 1.0):
@@ -159,11 +133,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         force = params[1] == FORCE
         done = self._ap.arm(force=force) if params[0] else self._ap.disarm(force=force)
         return ACCEPTED if done else FAILED
-
-    def cmd_request_message(self, params: Params7, link: ArduPilotEndpoint) -> int:
-        if params[0] == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-            return self.cmd_get_message_interval(params[1:], link)
-        return super().cmd_request_message(params, link)
 
     def cmd_nav_takeoff(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         height_m = params[6]

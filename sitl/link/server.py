@@ -75,11 +75,6 @@ class Endpoint(ABC, Generic[Ap]):
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Change a stream. Return False if the firmware refuses."""
 
-    def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
-        stream = self._streams.get(message_id)
-        return -1 if stream is None else stream.interval_us
-
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT; number the chunks of a long text."""
         data = text.encode("ascii", "replace")
@@ -118,10 +113,6 @@ class Endpoint(ABC, Generic[Ap]):
             self.send(message)
         return True
 
-    def send_interval(self, message_id: int) -> None:
-        interval_us = self.interval_us(message_id)
-        self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
-
     def send_all_params(self) -> None:
         """Send every parameter from the first, at most 250 per second."""
         self._queued_params = deque(range(len(self._ap.params.names)))
@@ -140,11 +131,6 @@ DENIED: int = mav.MAV_RESULT_DENIED
 UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
 FORCE = 21196.0  # param 2 of ARM_DISARM that overrides a refusal (MAVLink common.xml)
-UINT16_MAX = 65535
-COMMAND_FIELDS = {
-    "COMMAND_LONG": tuple(f"param{n}" for n in range(1, 8)),
-    "COMMAND_INT": ("param1", "param2", "param3", "param4", "x", "y", "z"),
-}
 
 Link = TypeVar("Link", bound=Endpoint[Any])
 Params7: TypeAlias = tuple[float, ...]
@@ -176,7 +162,6 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         """Act on the bytes of one datagram, or of one read of a stream."""
         link = self.links[link_id]
         for message in link.parse(data):
-            self._pass_on(link, message)
             handler = getattr(self, f"on_{message.get_type().lower()}", None)
             if handler is not None and self._is_accepted(message):
                 self._arrived_ns = arrived_ns
@@ -198,9 +183,6 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
     def _is_accepted(self, message: Message) -> bool:
         """True if the firmware acts on the message of this sender."""
 
-    def _pass_on(self, link: Link, message: Message) -> None:
-        """Called with every message of the link, also those for other systems. No-op."""
-
     @abstractmethod
     def _announce(self) -> None:
         """Queue messages that precede the texts."""
@@ -213,19 +195,11 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         return UNSUPPORTED if handler is None else handler(params, link)
 
     def on_command_long(self, link: Link, message: Message) -> None:
-        fields = COMMAND_FIELDS[message.get_type()]
-        params = tuple(float(getattr(message, name)) for name in fields)
+        params = tuple(float(getattr(message, f"param{n}")) for n in range(1, 8))
         result = self._execute(message, params, link)
         if result is not None:
-            send_ack(link, message, message.command, result)
-
-    on_command_int = on_command_long
-
-    def cmd_get_message_interval(self, params: Params7, link: Link) -> int:
-        if not math.isfinite(params[0]) or not 0 <= params[0] <= UINT16_MAX:
-            return self.bad_interval
-        link.send_interval(int(params[0]))
-        return ACCEPTED
+            sender = (message.get_srcSystem(), message.get_srcComponent())
+            link.send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
 
     def cmd_set_message_interval(self, params: Params7, link: Link) -> int:
         is_plain = all(params[index] == 0.0 for index in self.zero_interval_params)
@@ -258,18 +232,3 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         if message.tc1 == 0:
             uptime_us = (self._arrived_ns - self._ap.boot_ns) // 1000
             link.send(mav.MAVLink_timesync_message(uptime_us * 1000, message.ts1))
-
-
-def rc_values_us(message: Message) -> list[int]:
-    """Return the 18 channels of an RC_CHANNELS_OVERRIDE."""
-    return [getattr(message, f"chan{n}_raw") for n in range(1, 19)]
-
-
-def sender_of(message: Message) -> tuple[int, int]:
-    """Return the system and component that sent a message."""
-    return message.get_srcSystem(), message.get_srcComponent()
-
-
-def send_ack(link: Endpoint[Any], message: Message, number: int, result: int) -> None:
-    """Answer a command with its MAV_RESULT."""
-    link.send(mav.MAVLink_command_ack_message(number, result, 0, 0, *sender_of(message)))

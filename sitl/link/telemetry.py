@@ -1,12 +1,10 @@
 """Messages common to both firmwares, from the state of the vehicle."""
 
 import math
-from collections.abc import Iterable
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.vehicle.dynamics import GRAVITY_MPS2
 from sitl.vehicle.firmware import Autopilot
 from sitl.vehicle.rotation import Vec3, conjugate, rotate, to_euler
 
@@ -58,10 +56,6 @@ class Telemetry(Generic[Ap]):
         return None if fields is None else kind(*fields)
 
     @property
-    def gyro_radps(self) -> Vec3:
-        return self.ap.sensed.rate_body_radps
-
-    @property
     def version(self) -> int:
         """Version of the firmware, for AUTOPILOT_VERSION."""
         raise NotImplementedError
@@ -90,34 +84,25 @@ class Telemetry(Generic[Ap]):
         lat = self.lat_deg + north / METRES_PER_DEGREE
         lon = self.lon_deg + east / (METRES_PER_DEGREE * math.cos(math.radians(self.lat_deg)))
         heights_mm = (round(1000.0 * (self.alt_m - down)), round(-1000.0 * down))
-        velocity_cmps = _int16(self.ap.sensed.velocity_ned_mps, 100.0)
+        scaled = (round(100.0 * speed) for speed in self.ap.sensed.velocity_ned_mps)
+        velocity_cmps = (max(-INT16, min(INT16, cmps)) for cmps in scaled)
         nose_cdeg = round(math.degrees(self.ap.yaw_rad) % 360.0 * 100.0) % 36000
         place = (round(lat * 1e7), round(lon * 1e7), *heights_mm)
         return (self.boot_ms, *place, *velocity_cmps, nose_cdeg)
-
-    def scaled_imu(self) -> Fields:
-        """In milli-g, mrad/s and mGauss."""
-        force_mps2 = self.ap.sensed.specific_force_body_mps2
-        accel = _int16([1000.0 * force / GRAVITY_MPS2 for force in force_mps2], 1.0)
-        gyro, field = _int16(self.gyro_radps, 1000.0), _int16(self._mag_gauss, 1000.0)
-        return (self.boot_ms, *accel, *gyro, *field, round(100.0 * self.temperature_c))
 
     def highres_imu(self) -> Fields:
         """In m/s^2, rad/s and the firmware's unit of the field."""
         height_m = -self.ap.sensed.position_ned_m[2]
         pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
         air = (pressure, 0.0, self.alt_m + height_m, self.temperature_c)
-        field = (self.field_per_gauss * gauss for gauss in self._mag_gauss)
-        imu = (*self.ap.sensed.specific_force_body_mps2, *self.gyro_radps, *field)
+        body = self.ap.sensed
+        field_gauss = rotate(conjugate(body.ned_from_body_wxyz), self.field_ned_gauss)
+        field = (self.field_per_gauss * gauss for gauss in field_gauss)
+        imu = (*body.specific_force_body_mps2, *body.rate_body_radps, *field)
         return (self.boot_us, *imu, *air, _IMU_FIELDS_UPDATED, 0)
 
     def autopilot_version(self) -> Fields:
         return (self.capabilities, self.version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, self.ap.system_id)
-
-    @property
-    def _mag_gauss(self) -> Vec3:
-        """Magnetic field in body axes."""
-        return rotate(conjugate(self.ap.sensed.ned_from_body_wxyz), self.field_ned_gauss)
 
     def _health(self, *, present: int, enabled: int, healthy: int) -> Fields:
         """Return the fields of SYS_STATUS with these sensors and the battery."""
@@ -130,8 +115,3 @@ class Telemetry(Generic[Ap]):
         if is_landing:
             return int(mav.MAV_LANDED_STATE_LANDING)
         return int(mav.MAV_LANDED_STATE_TAKEOFF if is_taking_off else mav.MAV_LANDED_STATE_IN_AIR)
-
-
-def _int16(values: Iterable[float], scale: float) -> list[int]:
-    """Scale, round and clamp values to a field of 16 bits."""
-    return [max(-INT16, min(INT16, round(scale * value))) for value in values]

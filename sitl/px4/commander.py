@@ -160,11 +160,6 @@ class Commander(Autopilot):
         self._intend(mode)
         return True
 
-    def refuse_frame(self, frame: int) -> None:
-        """Report a velocity setpoint in axes that PX4 does not support."""
-        text = f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported"
-        self._deny(text, "mavlink_rcv_sp_target_unsup_coord")
-
     def finish_takeoff(self) -> None:
         if self.intended is Px4Mode.AUTO_TAKEOFF:
             self._intend(Px4Mode.AUTO_LOITER)

@@ -30,7 +30,6 @@ _EVENT, _EVENT_CRC_EXTRA = struct.Struct("<IIHBBB40s"), 160
 _EVENT_LEVELS = 0x66  # for peers and for the vehicle's own log: info
 
 _FIRMWARE_VERSIONS: dict[Px4Release, int] = {
-    "1.14": 0x010E04FF,
     "1.17": 0x011100FF,
     "1.18": 0x01120080,  # beta
 }
@@ -60,11 +59,6 @@ class Px4Telemetry(Telemetry[Px4]):
     pressure_hpa, temperature_c = 955.6, 25.0
     capabilities = 0xE8FF
     dialect = mav
-
-    def __init__(self, ap: Px4) -> None:
-        super().__init__(ap)
-        if ap.config.px4_release == "1.14":  # it came with 1.15 (upstream commit bb900264e0)
-            self.names = {key: name for key, name in self.names.items() if key != CURRENT_MODE}
 
     @property
     def version(self) -> int:
@@ -135,10 +129,6 @@ class Px4Telemetry(Telemetry[Px4]):
         turn = (math.nan, flight.yaw_rate_radps)
         return (*head, *none, *flight.velocity_ned_mps, *none, *turn)
 
-    def timesync(self) -> Fields:
-        """The vehicle's request; the peer's answer needs no action."""
-        return (0, self.ap.uptime_ns)
-
     def estimator_status(self) -> Fields:
         """The only message with the validity of the horizontal position."""
         found = _ESTIMATOR_ON_GROUND if self.ap.landed else _ESTIMATOR_WITH_POSITION
@@ -185,32 +175,21 @@ def _at_rate(ap: Px4, period_ms: int) -> int:
 
 
 HEARTBEAT_US = 1_000_000
-MAX_INTERVAL_US = 2**31 - 1  # MESSAGE_INTERVAL has an int32
-
-_BOTH = {CURRENT_MODE: 0.5, mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0}
-ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
-    _BOTH
-    | by_message(ATTITUDE=100.0, ATTITUDE_QUATERNION=50.0, GLOBAL_POSITION_INT=50.0)
-    | by_message(HIGHRES_IMU=50.0, LOCAL_POSITION_NED=30.0, RC_CHANNELS=20.0, TIMESYNC=10.0)
-    | by_message(ATTITUDE_TARGET=10.0, POSITION_TARGET_LOCAL_NED=10.0)
-    | by_message(EXTENDED_SYS_STATE=5.0, SYS_STATUS=5.0)
-)
-"""Message rates on a link to a companion computer (mode Onboard)."""
-GCS_HZ: Mapping[int, float] = MappingProxyType(
-    _BOTH
+DEFAULT_HZ: Mapping[int, float] = MappingProxyType(
+    {CURRENT_MODE: 0.5}
+    | by_message(ESTIMATOR_STATUS=1.0)
     | by_message(ATTITUDE=50.0, ATTITUDE_QUATERNION=50.0, ATTITUDE_TARGET=50.0)
     | by_message(LOCAL_POSITION_NED=50.0, GLOBAL_POSITION_INT=50.0, RC_CHANNELS=20.0)
     | by_message(POSITION_TARGET_LOCAL_NED=1.5, EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
 )
-"""Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
+"""Message rates without a request (mode Normal with the SITL script's additions)."""
 
 
 class Px4Endpoint(Endpoint[Px4]):
-    """Link to a ground station, or to a companion computer, which gets other streams."""
+    """Link of PX4, with its events."""
 
-    def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
-        default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
-        self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
+    def __init__(self, ap: Px4) -> None:
+        self._default_us = {key: round(1e6 / rate) for key, rate in DEFAULT_HZ.items()}
         self._event_sequence = 0
         super().__init__(ap, Px4Telemetry(ap))
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
@@ -239,7 +218,6 @@ class Px4Endpoint(Endpoint[Px4]):
         if interval_us < 0:
             self._streams.pop(message_id, None)
         else:
-            interval_us = min(interval_us, MAX_INTERVAL_US)
             due_ns = self._ap.now_ns + interval_us * NS_PER_US
             self._streams[message_id] = Stream(interval_us=interval_us, due_ns=due_ns)
 

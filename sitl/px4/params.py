@@ -12,7 +12,6 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import DEFAULT_VEHICLE, Px4Release, VehicleConfig
 from sitl.vehicle.firmware import Params, float32
 
-DEAD_ZONE = "MAN_DEADZONE"
 _INTEGERS: Mapping[str, int] = MappingProxyType(
     {
         "COM_RC_OVERRIDE": 1,  # bit 0: sticks take over in AUTO modes, bit 1: in OFFBOARD
@@ -36,7 +35,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "COM_RC_LOSS_T": 0.5,  # s
         "COM_RC_STICK_OV": 30.0,  # % of stick travel per second
         "COM_SPOOLUP_TIME": 1.0,  # s
-        DEAD_ZONE: 0.1,  # of the stick, to each side of the middle
+        "MAN_DEADZONE": 0.1,  # of the stick, to each side of the middle
         "MAN_OVERRIDE_SPD": 1.0,  # full sticks per second; -1: off
         "MC_ACRO_P_MAX": 100.0,  # deg/s
         "MC_PITCHRATE_MAX": 220.0,  # deg/s
@@ -64,17 +63,9 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
     | {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_V_AUTO_DN": 1.5, "MPC_Z_V_AUTO_UP": 3.0}
     | {"RTL_MIN_DIST": 10.0, "RTL_RETURN_ALT": 30.0}
 )
-_OLD_NAMES: Mapping[str, float] = {
-    "MPC_HOLD_DZ": 0.1,
-    "MPC_YAW_EXPO": 0.6,
-    "MPC_Z_MAN_EXPO": 0.6,
-}
-"""Parameters of releases before 1.17 in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
-_OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
 _ABSENT: Mapping[Px4Release, tuple[str, ...]] = {
-    "1.14": (*_NEW_OVERRIDE, DEAD_ZONE),
-    "1.17": _NEW_OVERRIDE,
-    "1.18": _OLD_OVERRIDE,
+    "1.17": ("MAN_OVERRIDE_SPD",),
+    "1.18": ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
 }
 DEFAULT_RATE_P = float32(_FLOATS["MC_ROLLRATE_P"])
 
@@ -111,12 +102,10 @@ class Px4Params(Params):
         values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(config.conditions)}
         for name in _ABSENT[config.px4_release]:
             del values[name]
-        values |= {} if DEAD_ZONE in values else _OLD_NAMES
         if config.receiver_us is not None:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
         super().__init__(values, _INTEGERS)
 
     @property
     def dead_zone(self) -> float:
-        share = self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]
-        return min(share, 0.99)
+        return min(self._values["MAN_DEADZONE"], 0.99)

@@ -1,4 +1,4 @@
-"""Message handling of the simulated PX4, without I/O, and forwarding between its links.
+"""Message handling of the simulated PX4, without I/O.
 
 Senders are not filtered: sticks, setpoints and commands of any system are accepted if they are
 addressed to the vehicle or broadcast.
@@ -17,8 +17,6 @@ from sitl.link.server import (
     REJECTED,
     MavlinkServer,
     Params7,
-    rc_values_us,
-    send_ack,
 )
 from sitl.link.telemetry import Message
 from sitl.px4.autopilot import Px4
@@ -30,7 +28,6 @@ from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint, VelocitySetpoint
 from sitl.vehicle.rotation import Vec3, horizontal, norm, normalised
 
-_RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _IGNORE_RATES = 0b111
 _IGNORE_YAW_RATE = 0b100
@@ -44,9 +41,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     zero_interval_params = (2, 6)
 
     def __init__(self, ap: Px4, link_count: int, log: FlightLog) -> None:
-        onboard = ap.config.onboard_links
-        links = [Px4Endpoint(ap, is_onboard=n in onboard) for n in range(link_count)]
-        super().__init__(ap, links, log)
+        super().__init__(ap, [Px4Endpoint(ap) for _ in range(link_count)], log)
 
     def _announce(self) -> None:
         """Send events before the texts."""
@@ -62,20 +57,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         is_ours = component in (0, mav.MAV_COMP_ID_AUTOPILOT1)
         return system in (0, self._ap.system_id) and is_ours
 
-    def _pass_on(self, link: Px4Endpoint, message: Message) -> None:
-        """Forward a frame unchanged to the other links, unless it is for the vehicle alone.
-
-        MANUAL_CONTROL counts as a broadcast, since its target is no ordinary target field. Of
-        heartbeats only those of ground stations are forwarded.
-        """
-        is_heartbeat = message.get_type() == "HEARTBEAT"
-        is_ours = getattr(message, "target_system", 0) == self._ap.system_id
-        if is_ours or (is_heartbeat and message.type != mav.MAV_TYPE_GCS):
-            return
-        for other in self.links:
-            if other is not link:
-                other.pass_on(bytes(message.get_msgbuf()))
-
     def on_heartbeat(self, link: Px4Endpoint, message: Message) -> None:
         if message.type == mav.MAV_TYPE_GCS:
             link.has_gcs = True
@@ -84,12 +65,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         self._log.manual_controls.add(self._arrived_ns)
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, self._arrived_ns)
-
-    def on_rc_channels_override(self, _link: Px4Endpoint, message: Message) -> None:
-        """Treat the values as those of a receiver; PX4 has no override."""
-        self._log.overrides.add(self._arrived_ns)
-        values_us = rc_values_us(message)
-        self._ap.receiver.move([0 if value == _RC_IGNORE else value for value in values_us])
 
     def on_set_attitude_target(self, _link: Px4Endpoint, message: Message) -> None:
         mask = message.type_mask
@@ -107,10 +82,8 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
 
     def on_set_position_target_local_ned(self, link: Px4Endpoint, message: Message) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
-        if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
-            self._ap.refuse_frame(frame)
-            return
-        if mask & _IGNORE_VELOCITY:
+        is_known = frame in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED)
+        if not is_known or mask & _IGNORE_VELOCITY:
             return
         velocity: Vec3 = (message.vx, message.vy, message.vz)
         if frame == mav.MAV_FRAME_BODY_NED:
@@ -127,12 +100,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if self._ap.mode_name == "OFFBOARD":
             self._log.setpoints.add(self._arrived_ns)
 
-    def on_set_mode(self, link: Px4Endpoint, message: Message) -> None:
-        """Change the mode by SET_MODE, acknowledged as DO_SET_MODE, which replaced it."""
-        main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-        result = self._change_mode(message, message.base_mode, main, sub)
-        send_ack(link, message, mav.MAV_CMD_DO_SET_MODE, result)
-
     def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
         if message.command == mav.MAV_CMD_DO_SET_MODE:
             return self._change_mode(message, *params[:3])
@@ -146,18 +113,9 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if not int(base_mode) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
             return REJECTED
         is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
-        return self._to_mode(mode, says_why=is_station)
-
-    def _to_mode(self, mode: Px4Mode, *, says_why: bool = True) -> int:
         if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
-        return ACCEPTED if self._ap.set_mode(mode, says_why=says_why) else REJECTED
-
-    def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
-        return self._to_mode(Px4Mode.AUTO_RTL)
-
-    def cmd_nav_land(self, _params: Params7, _link: Px4Endpoint) -> int:
-        return self._to_mode(Px4Mode.AUTO_LAND)
+        return ACCEPTED if self._ap.set_mode(mode, says_why=is_station) else REJECTED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
         if params[0] not in (0.0, 1.0):

@@ -172,20 +172,20 @@ class StickInput:
         self.gesture.see(side, now_ns)
 
 
-def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:
+def curve(value: float, dead_zone: float) -> float:
     """Apply dead zone and expo to a stick in [-1, 1]."""
     beyond = max(0.0, abs(value) - dead_zone) / (1.0 - dead_zone)
-    return math.copysign((1.0 - expo) * beyond + expo * beyond**3, value)
+    return math.copysign((1.0 - EXPO) * beyond + EXPO * beyond**3, value)
 
 
 def climb_mps(sticks: Px4Sticks, params: Px4Params) -> float:
     """Return the climb rate of ALTCTL and POSCTL, + up."""
-    share = curve(sticks.throttle, params.dead_zone, params.get("MPC_Z_MAN_EXPO", EXPO))
+    share = curve(sticks.throttle, params.dead_zone)
     return share * params["MPC_Z_VEL_MAX_UP" if share > 0.0 else "MPC_Z_VEL_MAX_DN"]
 
 
 def yaw_rate_radps(sticks: Px4Sticks, params: Px4Params) -> float:
-    share = curve(sticks.yaw, params.dead_zone, params.get("MPC_YAW_EXPO", EXPO))
+    share = curve(sticks.yaw, params.dead_zone)
     return math.radians(params["MPC_MAN_Y_MAX"]) * share
 
 

@@ -18,8 +18,8 @@ ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev"]
 """ArduPilot release for the names of parameters; 4.5 has those of 4.6. The measured firmware,
 4.7-dev, has the new names of the system ids and the old names of the rest."""
 
-Px4Release: TypeAlias = Literal["1.14", "1.17", "1.18"]
-"""PX4 release for parameters, stick override and messages; 1.18 was measured."""
+Px4Release: TypeAlias = Literal["1.17", "1.18"]
+"""PX4 release for parameters and stick override; 1.18 was measured."""
 
 SIGNING_TICK_NS = 10_000
 
@@ -45,8 +45,6 @@ class VehicleConfig:
     """Time from boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0
     """Time from boot until the estimator has a position (about 40 s on the real firmware)."""
-    onboard_links: frozenset[int] = frozenset()
-    """Indices of the links to companion computers, which get other streams from PX4."""
     signing: SigningKey | None = None
     """Sign all messages, and refuse those not signed with this key."""
     conditions: Conditions = NOMINAL

@@ -82,11 +82,6 @@ def test_a_message_that_cannot_be_streamed_fails(px4, message_id):
     assert px4.stream(message_id, 10) == FAILED
 
 
-def test_the_interval_is_reported(px4):
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
-    assert px4.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE) == 20_000
-
-
 def test_an_integer_travels_as_its_bytes(px4):
     assert px4.get_int("COM_RC_IN_MODE") == 1
     px4.change("COM_RC_IN_MODE", 3)

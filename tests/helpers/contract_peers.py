@@ -171,12 +171,6 @@ class Companion:
         self._streams.add(message_id)
         return self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, int(1e6 / rate_hz))
 
-    def interval_us(self, message_id: int) -> int:
-        self.send_command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, message_id)
-        interval = self.wait("MESSAGE_INTERVAL")
-        assert interval.message_id == message_id
-        return int(interval.interval_us)
-
     def arm(self) -> int:
         return self.command(ARM, 1)
 

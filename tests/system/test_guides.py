@@ -98,7 +98,7 @@ def test_the_terminals_of_the_guide_to_ardupilot_fly(ports: dict[str, str], tmp_
 
 def test_the_terminals_of_the_guide_to_px4_fly(ports: dict[str, str], tmp_path: Path) -> None:
     links = ["--autopilot", "px4", "--connect", f"udpout:127.0.0.1:{ports['14550']}"]
-    links += ["--connect-onboard", f"udpout:127.0.0.1:{ports['14540']}"]
+    links += ["--connect", f"udpout:127.0.0.1:{ports['14540']}"]
     recording = fly_guide("docs/simulators.md", "PX4", links, ports, tmp_path)
     assert any(True for _ in open_flight(recording).frame_rows())
 

@@ -11,17 +11,12 @@ from helpers.contract_peers import named
 from helpers.ends import Ends
 from sitl.ardupilot.endpoint import ArduPilotTelemetry
 from sitl.ardupilot.flight_modes import Mode
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_MS
 from sitl.simulated_vehicle import SimulatedVehicle
 
 
-def test_only_heartbeats_and_timesync_come_without_a_request(station):
-    messages = station.run(10.5)
-    assert {m.get_type() for m in messages} == {"HEARTBEAT", "TIMESYNC"}
-    assert len(named(messages, "HEARTBEAT")) == 10
-    (request,) = named(messages, "TIMESYNC")
-    assert request.tc1 == 0
-    assert request.ts1 == 10 * NS_PER_S + 1
+def test_only_heartbeats_come_without_a_request(station):
+    assert [m.get_type() for m in station.run(10.5)] == ["HEARTBEAT"] * 10
 
 
 def test_intervals_belong_to_the_link_they_came_on():
@@ -77,10 +72,8 @@ def test_nan_in_a_message_is_refused_and_counted(station):
         (mav.MAV_CMD_DO_SET_MODE, (0, 2), mav.MAV_RESULT_DENIED),
         (mav.MAV_CMD_DO_SET_MODE, (1, 77), mav.MAV_RESULT_FAILED),
         (mav.MAV_CMD_COMPONENT_ARM_DISARM, (math.nan,), mav.MAV_RESULT_UNSUPPORTED),
-        (mav.MAV_CMD_GET_MESSAGE_INTERVAL, (70_000,), mav.MAV_RESULT_DENIED),
         (mav.MAV_CMD_REQUEST_MESSAGE, (148,), mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_REQUEST_MESSAGE, (331,), mav.MAV_RESULT_FAILED),
-        (mav.MAV_CMD_NAV_LAND, (math.nan,) * 7, mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1,), mav.MAV_RESULT_ACCEPTED),
         (mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (2,), mav.MAV_RESULT_UNSUPPORTED),
         (mav.MAV_CMD_NAV_TAKEOFF, (), mav.MAV_RESULT_FAILED),
