@@ -38,9 +38,9 @@ class FlightLog:
         self._start_ns = start_ns
         self._course = course or Course(seed=0, gates=())
         self._gates = GateCounter(self._course)
-        self.overrides = _Arrivals()  # RC_CHANNELS_OVERRIDE that drives at least one stick
-        self.manual_controls = _Arrivals()  # only of senders that the vehicle listens to
-        self.setpoints = _Arrivals()  # accepted attitudes, rates and velocities
+        self.overrides = 0  # RC_CHANNELS_OVERRIDE that drives at least one stick
+        self.manual_controls = 0
+        self.setpoints = 0  # accepted attitudes, rates and velocities
         self.releases = 0  # RC_CHANNELS_OVERRIDE that only releases sticks
         self._sticks = _StickRecord()
         self._arrived_ns = start_ns
@@ -149,10 +149,10 @@ class FlightLog:
         return {
             "start_ns": self._start_ns,
             "duration_s": self._t_s(ap.now_ns),
-            "overrides": self.overrides.summary(),
+            "overrides": self.overrides,
             "releases": self.releases,
-            "manual_control": self.manual_controls.summary(),
-            "setpoints": self.setpoints.summary(),
+            "manual_control": self.manual_controls,
+            "setpoints": self.setpoints,
             "refused_messages": self.refused_messages,
             "armed_s": self._armed_ns / NS_PER_S,
             "max_altitude_m": self._max_altitude_m,
@@ -200,24 +200,6 @@ class _StickRecord:
         row["climb_mps"] = round(-body.velocity_ned_mps[2], 3)
         row["height_m"] = round(-body.position_ned_m[2], 3)
         self.rows.append(row)
-
-
-class _Arrivals:
-    """Count of one kind of message, and the times of the first and the last."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._first_ns = self._last_ns = 0
-
-    def add(self, arrived_ns: int) -> None:
-        self._first_ns = self._first_ns if self._count else arrived_ns
-        self._last_ns = arrived_ns
-        self._count += 1
-
-    def summary(self) -> dict[str, Any]:
-        span_s = (self._last_ns - self._first_ns) / NS_PER_S
-        rate_hz = (self._count - 1) / span_s if span_s > 0.0 else None
-        return {"count": self._count, "rate_hz": rate_hz}
 
 
 def write_report(path: Path, summary: dict[str, Any]) -> None:

@@ -85,7 +85,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         self._ap.gcs_failsafe.on_contact(self._arrived_ns)
         raw_us = [getattr(message, f"chan{n + 1}_raw") for n in range(OVERRIDDEN_CHANNELS)]
         if set(raw_us) - {RELEASE, IGNORE}:
-            self._log.overrides.add(self._arrived_ns)
+            self._log.overrides += 1
         elif RELEASE in raw_us:
             self._log.releases += 1
         self._ap.rc.override(raw_us, self._arrived_ns)
@@ -97,7 +97,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         setpoint = _attitude_setpoint(message)
         if setpoint is not None:
             ap.guided.follow_attitude(setpoint, ap.sensed, self._arrived_ns)
-            self._log.setpoints.add(self._arrived_ns)
+            self._log.setpoints += 1
         elif ap.mode is Mode.GUIDED:
             ap.guided.brake(ap.sensed)
 
@@ -111,7 +111,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.brake(ap.sensed)
         else:
             ap.guided.follow_velocity(setpoint, ap.sensed, self._arrived_ns)
-            self._log.setpoints.add(self._arrived_ns)
+            self._log.setpoints += 1
 
     def on_request_data_stream(self, link: ArduPilotEndpoint, message: Message) -> None:
         rate_hz = message.req_message_rate if message.start_stop else 0

@@ -62,7 +62,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             link.has_gcs = True
 
     def on_manual_control(self, link: Px4Endpoint, message: Message) -> None:
-        self._log.manual_controls.add(self._arrived_ns)
+        self._log.manual_controls += 1
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, self._arrived_ns)
 
@@ -98,7 +98,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     def _follow(self, setpoint: Setpoint) -> None:
         self._ap.set_setpoint(setpoint, self._arrived_ns)
         if self._ap.mode_name == "OFFBOARD":
-            self._log.setpoints.add(self._arrived_ns)
+            self._log.setpoints += 1
 
     def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
         if message.command == mav.MAV_CMD_DO_SET_MODE:

@@ -42,7 +42,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nothing_is_sent_that_moves_the_vehicle(flown: Path) -> None:
     report = json.loads((flown / "fc.json").read_text())
-    assert report["overrides"]["count"] == 0
+    assert report["overrides"] == 0
     assert report["releases"] == 0
     assert [entry["mode"] for entry in report["modes"]] == ["STABILIZE", "ALT_HOLD"]
     assert len(report["gates"]["passed"]) >= 1, "the pilot has moved it, and nobody else"

@@ -105,6 +105,4 @@ def test_the_report_counts_the_setpoints_that_were_followed(station):
             station.send(message)
             station.run(0.02)
     vehicle = station.vehicle
-    setpoints = vehicle.log.summary(vehicle.ap)["setpoints"]
-    assert setpoints["count"] == 5
-    assert setpoints["rate_hz"] == pytest.approx(50.0, rel=0.01)
+    assert vehicle.log.summary(vehicle.ap)["setpoints"] == 5
