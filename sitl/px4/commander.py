@@ -87,9 +87,7 @@ class Commander(Autopilot):
             return False
         if mode.needs_position and not self.position_ready:
             return False
-        if mode is Px4Mode.OFFBOARD:
-            return self._has_stream
-        return mode is not Px4Mode.AUTO_MISSION
+        return mode is not Px4Mode.OFFBOARD or self._has_stream
 
     @property
     def _has_stream(self) -> bool:

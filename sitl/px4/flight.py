@@ -116,13 +116,6 @@ class Px4Control:
     ) -> tuple[float, ...]:
         if mode is Px4Mode.OFFBOARD and setpoint is not None:
             return self._fly_offboard(setpoint, body)
-        if mode is Px4Mode.ACRO:
-            self.attitude = body.ned_from_body_wxyz
-            return self._turn_at(
-                pilot.acro_rates_radps(sticks, self._params),
-                pilot.manual_thrust(sticks, self._params, HOVER_THRUST),
-                body,
-            )
         yaw_rate = self._stick_yaw(sticks if mode.piloted else Px4Sticks(), body)
         yaw = self._heading_rad(body)
         if mode.manual_throttle:
@@ -147,8 +140,8 @@ class Px4Control:
             target, rates, thrust = setpoint
             if target is not None:
                 return self._lean_to(target, rates[2], thrust, body)
-            self.attitude = body.ned_from_body_wxyz
-            return self._turn_at(rates, thrust, body)
+            self.attitude, self.thrust = body.ned_from_body_wxyz, thrust
+            return mix(thrust, self._rates.rates(body, rates), SIH_QUAD)
         wanted = horizontal(setpoint.velocity_ned_mps)
         accel = self._accel_mps2 = self._horizontal.track(wanted, body)
         yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
@@ -165,10 +158,6 @@ class Px4Control:
     ) -> tuple[float, ...]:
         self.attitude, self.thrust, self.yaw_rate_radps = target, thrust, yaw_rate_radps
         return mix(thrust, self._rates.attitude(body, target, yaw_rate_radps), SIH_QUAD)
-
-    def _turn_at(self, rates_radps: Vec3, thrust: float, body: BodyState) -> tuple[float, ...]:
-        self.thrust = thrust
-        return mix(thrust, self._rates.rates(body, rates_radps), SIH_QUAD)
 
     def _stick_yaw(self, sticks: Px4Sticks, body: BodyState) -> float:
         wanted = pilot.yaw_rate_radps(sticks, self._params)

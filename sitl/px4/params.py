@@ -16,7 +16,7 @@ _INTEGERS: Mapping[str, int] = MappingProxyType(
     {
         "COM_RC_OVERRIDE": 1,  # bit 0: sticks take over in AUTO modes, bit 1: in OFFBOARD
         "COM_OBL_RC_ACT": 0,  # 0 position, 1 altitude, 2 stabilized, 3 RTL, 4 land, 5 hold
-        "COM_RCL_EXCEPT": 0,  # bit 0 mission, 1 hold, 2 offboard: lost sticks are no failsafe
+        "COM_RCL_EXCEPT": 0,  # bit 1 hold, 2 offboard: lost sticks are no failsafe
         "COM_RC_IN_MODE": 1,  # source of sticks: see `sitl.px4.sticks`
         "NAV_DLL_ACT": 0,  # a lost ground station does nothing
         "NAV_RCL_ACT": 2,  # lost sticks: 1 hold, 2 RTL, 3 land, 5 terminate, 6 disarm
@@ -37,7 +37,6 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "COM_SPOOLUP_TIME": 1.0,  # s
         "MAN_DEADZONE": 0.1,  # of the stick, to each side of the middle
         "MAN_OVERRIDE_SPD": 1.0,  # full sticks per second; -1: off
-        "MC_ACRO_P_MAX": 100.0,  # deg/s
         "MC_PITCHRATE_MAX": 220.0,  # deg/s
         "MC_PITCH_P": 4.0,  # 1/s
         "MIS_TAKEOFF_ALT": 2.5,  # m
@@ -53,7 +52,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "MPC_TKO_RAMP_T": 3.0,  # s
         "MPC_TKO_SPEED": 1.5,  # m/s
     }
-    | {"MAN_KILL_GEST_T": -1.0, "MC_ACRO_R_MAX": 100.0, "MC_ACRO_Y_MAX": 100.0}
+    | {"MAN_KILL_GEST_T": -1.0}
     | {"MC_PITCHRATE_P": 0.15, "MC_ROLLRATE_MAX": 220.0, "MC_ROLLRATE_P": 0.15, "MC_ROLL_P": 4.0}
     | {"MC_YAWRATE_MAX": 200.0, "MC_YAW_P": 2.8, "MPC_ACC_HOR": 3.0, "MPC_ACC_UP_MAX": 4.0}
     | {"MPC_JERK_MAX": 8.0, "MPC_MANTHR_MIN": 0.08, "MPC_THR_HOVER": 0.5, "MPC_THR_MAX": 1.0}

@@ -13,7 +13,7 @@ from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 from sitl.vehicle.firmware import Held
-from sitl.vehicle.rotation import Vec3, length
+from sitl.vehicle.rotation import length
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
@@ -25,7 +25,7 @@ FAST_SAMPLES = 3
 Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
 OLD_TAU_S, TAU_S = 0.1, 0.05  # low-pass of a stick's speed, before 1.18 and in 1.18
 
-_RECEIVER_ONLY, _LINKS_ONLY, _KEEP_FIRST, _NONE, *_PRIORITIES = 0, 1, 3, 4, 5, 6, 7, 8
+_RECEIVER_ONLY, _LINKS_ONLY, _NONE, *_PRIORITIES = 0, 1, 4, 5, 6, 7, 8
 """Values of COM_RC_IN_MODE. 2 takes any source, and keeps it until it is lost. From 5 on a source
 replaces a lower one at once: 6 and 8 prefer links to the receiver, 7 and 8 the highest link."""
 
@@ -88,7 +88,6 @@ class StickInput:
         self.moved_fast = False
         """A stick moves faster than COM_RC_STICK_OV or MAN_OVERRIDE_SPD."""
         self._source: int | None = None
-        self._first_source: int | None = None
         self._unread: dict[int, Px4Sticks] = {}
         """Samples of sources that did not win, since the last check."""
         self._never_ages = False
@@ -109,8 +108,6 @@ class StickInput:
     def on_sticks(self, source: int, sticks: Px4Sticks, now_ns: int) -> None:
         if self._wins(source):
             self._source = source
-            if self._first_source is None:
-                self._first_source = source
             self._choose(sticks, now_ns)
         else:
             self._unread[source] = sticks
@@ -137,8 +134,6 @@ class StickInput:
         mode = self._params.integer("COM_RC_IN_MODE")
         if mode == (_LINKS_ONLY if source == RC_SOURCE else _RECEIVER_ONLY) or mode == _NONE:
             return False
-        if mode == _KEEP_FIRST:
-            return self._first_source in (None, source)
         if not self.valid or self._never_ages or self._source is None or source == self._source:
             return True
         prefers_higher = mode in ((6, 8) if RC_SOURCE in (source, self._source) else (7, 8))
@@ -201,14 +196,6 @@ def lean_rad(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
     return sticks.right * scale, -sticks.forward * scale
 
 
-def acro_rates_radps(sticks: Px4Sticks, params: Px4Params) -> Vec3:
-    return (
-        math.radians(params["MC_ACRO_R_MAX"]) * sticks.right,
-        -math.radians(params["MC_ACRO_P_MAX"]) * sticks.forward,
-        math.radians(params["MC_ACRO_Y_MAX"]) * sticks.yaw,
-    )
-
-
 def speed_mps(sticks: Px4Sticks, params: Px4Params) -> complex:
     """Return POSCTL's final speed, forward + 1j * right; both sticks share MPC_VEL_MANUAL."""
     deflection = length(sticks.lean)
@@ -219,7 +206,7 @@ def speed_mps(sticks: Px4Sticks, params: Px4Params) -> complex:
 
 
 def manual_thrust(sticks: Px4Sticks, params: Px4Params, hover: float) -> float:
-    """Return the collective of STAB and ACRO: two lines that meet at hover thrust, mid-stick."""
+    """Return the collective of STAB: two lines that meet at hover thrust, mid-stick."""
     if sticks.throttle < 0.0:
         least = params["MPC_MANTHR_MIN"]
         return least + (1.0 + sticks.throttle) * (hover - least)

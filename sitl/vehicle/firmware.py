@@ -132,7 +132,6 @@ class Params:
         self._by_wire_name = {name: by_wire_name[name] for name in sorted(by_wire_name)}
         self.names: tuple[str, ...] = tuple(self._by_wire_name)
         """Names on the wire, in PARAM_VALUE's order."""
-        self.changes = 0  # count of changes: PX4's modules do not learn which value changed
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -158,7 +157,6 @@ class Params:
             (new,) = struct.unpack(kind, struct.pack(kind, int(value) if is_integer else value))
         except (OverflowError, struct.error):
             return False
-        self.changes += new != self._values[name]
         self._values[name] = new
         return True
 

@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from helpers.contract_peers import REBOOT_FORCE
 from helpers.px4_companion import (
     ACCEPTED,
-    ACRO,
     ALTCTL,
     LOITER,
     MID,
@@ -68,7 +67,7 @@ def test_some_input_modes_ignore_mavlinks_sticks(px4, in_mode):
     assert not echoes(px4.fly(0.5))
 
 
-@pytest.mark.parametrize("mode", [STAB, ACRO, ALTCTL, POSCTL])
+@pytest.mark.parametrize("mode", [STAB, ALTCTL, POSCTL])
 def test_without_sticks_their_modes_do_not_arm(px4_armable, mode):
     px4_armable.get_ready(LOITER)
     px4_armable.advance(1.0)
@@ -94,7 +93,6 @@ def test_hold_arms_without_sticks_and_return_does_not(px4_armable):
         (STAB, 0, ACCEPTED),
         (STAB, 50, ACCEPTED),
         (STAB, 150, REJECTED),
-        (ACRO, 500, REJECTED),
         (ALTCTL, 0, ACCEPTED),
         (ALTCTL, 500, ACCEPTED),
         (ALTCTL, 1000, REJECTED),

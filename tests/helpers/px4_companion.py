@@ -12,7 +12,7 @@ from sitl.clock import NS_PER_S
 from sitl.vehicle.rotation import from_euler
 
 ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
-ALTCTL, POSCTL, ACRO, OFFBOARD, STAB = (2, 0), (3, 0), (5, 0), (6, 0), (7, 0)
+ALTCTL, POSCTL, OFFBOARD, STAB = (2, 0), (3, 0), (6, 0), (7, 0)
 TAKEOFF, LOITER, RTL, LAND = (4, 2), (4, 3), (4, 5), (4, 6)
 MID = (0, 0, 500, 0)
 EVENT, CURRENT_MODE = 410, 436

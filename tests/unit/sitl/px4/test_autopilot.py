@@ -1,4 +1,4 @@
-"""The PX4 vehicle without its link: airborne start, budget of failsafes, its airframe, position."""
+"""The PX4 vehicle without its link: airborne start, its airframe, position."""
 
 import math
 from dataclasses import replace

@@ -28,12 +28,12 @@ class Senders:
         return self.input.source
 
 
-@pytest.mark.parametrize(("in_mode", "after"), [(1, ONBOARD), (2, ONBOARD), (3, None)])
-def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
+@pytest.mark.parametrize("in_mode", [1, 2])
+def test_another_link_takes_over_when_the_first_has_stopped(in_mode):
     senders = Senders(in_mode)
     senders.send(0.1, GCS)
     assert senders.send(0.56, ONBOARD) == GCS
-    assert senders.send(0.1, ONBOARD) == after
+    assert senders.send(0.1, ONBOARD) == ONBOARD
 
 
 @pytest.mark.parametrize(
