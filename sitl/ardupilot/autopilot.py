@@ -5,62 +5,36 @@ see them. This module knows nothing about MAVLink, sockets or the host's time.
 """
 
 import math
-from bisect import bisect_left
-from contextlib import suppress
 
 from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import (
-    DEBOUNCE_NS,
-    GESTURE_NS,
-    RcEngine,
-    Sticks,
-    climb_rate_mps,
-    gesture_side,
-    read_sticks,
-)
+from sitl.ardupilot.rc import RcEngine, Sticks, climb_rate_mps, read_sticks
 from sitl.clock import NS_PER_S
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
-from sitl.vehicle.firmware import STOPPED, Autopilot, Held, Severity
-from sitl.vehicle.rotation import cos_tilt
+from sitl.vehicle.firmware import STOPPED, Autopilot, Severity
 
-HIGHEST_POSITION_US = (1230, 1360, 1490, 1620, 1749)
-"""Highest value of each of the mode switch's first five positions."""
-LOW_READS_TO_FAIL = 3
 GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz
 
 
 class RadioFailsafe:
-    """Failsafe for sticks absent for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
+    """Failsafe for sticks absent for RC_FS_TIMEOUT."""
 
     def __init__(self, params: ArduPilotParams, now_ns: int) -> None:
         self._params = params
         self._last_input_ns = now_ns
-        self._low_reads = 0
         self.active = False
 
-    def update(self, *, new_input: bool, throttle_us: int, can_fail: bool, now_ns: int) -> bool:
+    def update(self, *, new_input: bool, can_fail: bool, now_ns: int) -> bool:
         """Check after one RC update. Return True if ``active`` has changed."""
         was_active = self.active
-        if not self._params["FS_THR_ENABLE"]:
-            self._last_input_ns, self._low_reads, self.active = now_ns, 0, False
-        elif new_input:
-            self._last_input_ns = now_ns
-            self._check_throttle(throttle_us, can_fail=can_fail)
+        if new_input or not self._params["FS_THR_ENABLE"]:
+            self._last_input_ns, self.active = now_ns, False
         elif can_fail:
             timeout_ns = int(max(0.1, self._params["RC_FS_TIMEOUT"]) * NS_PER_S)
             self.active = self.active or now_ns - self._last_input_ns >= timeout_ns
         return self.active != was_active
-
-    def _check_throttle(self, throttle_us: int, *, can_fail: bool) -> None:
-        if throttle_us < self._params["FS_THR_VALUE"]:
-            self._low_reads = min(LOW_READS_TO_FAIL, self._low_reads + can_fail)
-            self.active = self.active or self._low_reads == LOW_READS_TO_FAIL
-        else:
-            self._low_reads = max(0, self._low_reads - 1)
-            self.active = self.active and self._low_reads > 0
 
 
 class GcsFailsafe:
@@ -92,9 +66,6 @@ class GcsFailsafe:
         return self.active != was_active
 
 
-CRASH_TILT_COS = 0.7
-CRASH_AFTER_NS = NS_PER_S
-
 FAILSAFE_MODES = {
     "FS_THR_ENABLE": {3: Mode.LAND, 7: Mode.BRAKE},
     "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
@@ -104,7 +75,6 @@ LAND_DELAY_NS = 4 * NS_PER_S  # LAND_WITH_DELAY_MS: time for the pilot to take o
 FS_OPTION_GUIDED = 4  # GUIDED continues without the pilot's sticks
 FS_OPTION_LANDING_CONTINUES = 8
 FS_OPTION_PILOT_CONTINUES = 16
-RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
 
 class ArduCopter(Autopilot):
@@ -124,10 +94,6 @@ class ArduCopter(Autopilot):
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
-        self._mode_position: int | None = None  # of the switch on FLTMODE_CH
-        self._mode_switch = Held(DEBOUNCE_NS)
-        self._gesture = Held(GESTURE_NS)
-        self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
 
     @property
@@ -157,11 +123,9 @@ class ArduCopter(Autopilot):
             return "Radio failsafe on"
         if self.gcs_failsafe.active:
             return "GCS failsafe on"
-        if self.params["FS_THR_ENABLE"] and self.rc.throttle_us < self.params["FS_THR_VALUE"]:
-            return "Throttle below failsafe"
         return None
 
-    def _stick_refusal(self, *, by_rudder: bool) -> str | None:
+    def _stick_refusal(self) -> str | None:
         """Return ArduCopter's reason why mode or sticks forbid arming, or None."""
         if not self.mode.can_arm:
             return f"{self.mode.name} mode not armable"
@@ -172,18 +136,15 @@ class ArduCopter(Autopilot):
         is_thrust = self.mode.manual_throttle and sticks.throttle > 0
         if is_thrust or climb_rate_mps(sticks, self.params) > 0.0:
             return "Throttle too high"
-        if self.params.integer("RC_OPTIONS") & RC_OPTION_SKIP_NEUTRAL_CHECK:
-            return None
         for axis, value in (("Roll", sticks.roll), ("Pitch", sticks.pitch), ("Yaw", sticks.yaw)):
-            if value != 0.0 and not (by_rudder and axis == "Yaw"):
+            if value != 0.0:
                 return f"{axis} (RC{self.rc.index_of(axis.upper()) + 1}) is not neutral"
         return None
 
-    def arm(self, *, force: bool, by_rudder: bool = False) -> bool:
-        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
+    def arm(self, *, force: bool = False) -> bool:
         if self.armed:
             return True
-        refusal = self.prearm_refusal() or self._stick_refusal(by_rudder=by_rudder)
+        refusal = self.prearm_refusal() or self._stick_refusal()
         if refusal is not None and not force:
             self.send_text(Severity.CRITICAL, f"Arm: {refusal}")
             return False
@@ -194,7 +155,6 @@ class ArduCopter(Autopilot):
         return True
 
     def disarm(self, *, force: bool) -> bool:
-        """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
         if self.armed and not (self.landed or force):
             return False
         if self.armed:
@@ -235,10 +195,6 @@ class ArduCopter(Autopilot):
         self.control.enter(mode, self.sensed)
         return True
 
-    def step(self) -> None:
-        super().step()
-        self._detect_crash()
-
     def _read_inputs(self) -> None:
         self._read_radio()
         if self.gcs_failsafe.update(self.now_ns):
@@ -252,7 +208,6 @@ class ArduCopter(Autopilot):
         if not self.mode.is_guided:
             self.mode = Mode.ALT_HOLD
         self._idle_since_ns = self.now_ns
-        self._tipped_since_ns = None
         self.control.enter(self.mode, self.sensed)
 
     def _motors(self) -> tuple[float, ...]:
@@ -287,23 +242,9 @@ class ArduCopter(Autopilot):
     def _is_pushing(self) -> bool:
         return self.control.collective > 0.5 * self.params["MOT_THST_HOVER"]
 
-    def _detect_crash(self) -> None:
-        """Stop the motors of a vehicle that lies on its side."""
-        is_tilted = cos_tilt(self.sensed.ned_from_body_wxyz) < CRASH_TILT_COS
-        is_tipped = self.armed and self.sensed.touching and is_tilted
-        self._tipped_since_ns = self._since(self._tipped_since_ns, is_tipped)
-        if self._has_held(self._tipped_since_ns, CRASH_AFTER_NS):
-            self.send_text(Severity.CRITICAL, "Crash: Disarming")
-            self.disarm(force=True)
-
     def _read_radio(self) -> None:
-        new_input = self.rc.update(self.now_ns)
-        self._read_mode_switch()
-        if new_input:
-            self._read_gesture()
         changed = self.radio_failsafe.update(
-            new_input=new_input,
-            throttle_us=self.rc.throttle_us,
+            new_input=self.rc.update(self.now_ns),
             can_fail=self.rc.found or self.armed,
             now_ns=self.now_ns,
         )
@@ -313,29 +254,6 @@ class ArduCopter(Autopilot):
             self._fail_over("Radio", "FS_THR_ENABLE")
         else:
             self.send_text(Severity.WARNING, "Radio Failsafe Cleared")
-
-    def _read_gesture(self) -> None:
-        self._gesture.see(gesture_side(read_sticks(self.rc, self.params)), self.now_ns)
-        match self._gesture.take(self.now_ns):
-            case 1:
-                self.arm(force=False, by_rudder=True)
-            case -1:
-                self.disarm(force=False)
-
-    def _read_mode_switch(self) -> None:
-        """Take the mode of a new position of the switch on FLTMODE_CH; the first changes none."""
-        channel = self.params.integer("FLTMODE_CH")
-        pwm_us = self.rc.channels_us[channel - 1] if 1 <= channel <= len(self.rc.channels_us) else 0
-        if not 900 < pwm_us < 2200:
-            return
-        self._mode_switch.see(1 + bisect_left(HIGHEST_POSITION_US, pwm_us), self.now_ns)
-        position = self._mode_switch.take(self.now_ns)
-        if position in (0, self._mode_position):
-            return
-        before, self._mode_position = self._mode_position, position
-        if before is not None:
-            with suppress(ValueError):  # ignore a mode that this vehicle lacks
-                self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))
 
     def _on_gcs_change(self) -> None:
         if not self.gcs_failsafe.active:

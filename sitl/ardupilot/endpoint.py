@@ -122,19 +122,6 @@ HEARTBEAT_INTERVAL_MS = 1000
 SHORTEST_INTERVAL_MS = 3  # 1 / (0.8 * SCHED_LOOP_RATE) in whole milliseconds, at 400 Hz
 MAX_INTERVAL_US = 60_000_000
 
-STREAM_GROUPS: dict[int, tuple[int, ...]] = {
-    getattr(mav, f"MAV_DATA_STREAM_{group}"): tuple(
-        getattr(mav, f"MAVLINK_MSG_ID_{name}") for name in names.split()
-    )
-    for group, names in (
-        ("EXTENDED_STATUS", "SYS_STATUS"),
-        ("RC_CHANNELS", "RC_CHANNELS"),
-        ("POSITION", "GLOBAL_POSITION_INT LOCAL_POSITION_NED"),
-        ("EXTRA1", "ATTITUDE"),
-        ("EXTRA3", "EKF_STATUS_REPORT"),
-    )
-}
-
 
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
     """Link whose message intervals, in whole ms, are shared by all of its senders."""
@@ -164,13 +151,6 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
             return False
         self._start(message_id, interval_ms)
         return True
-
-    def set_group(self, group: int, rate_hz: int) -> None:
-        """Apply REQUEST_DATA_STREAM, which replaces earlier intervals. Rate 0 stops the group."""
-        interval_ms = max(1000 // rate_hz, SHORTEST_INTERVAL_MS) if rate_hz > 0 else 0
-        for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
-            for message_id in STREAM_GROUPS.get(one, ()):
-                self._start(message_id, interval_ms)
 
     def _due(self) -> list[int]:
         """Return the ids of the messages to send now; after missed slots, each is sent once."""

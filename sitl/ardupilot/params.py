@@ -18,18 +18,12 @@ _FIXED = {
     "ATC_ANGLE_BOOST": 1.0,  # more thrust in a lean
     "ATC_RATE_Y_MAX": 0.0,  # deg/s, in GUIDED only; 0: no limit
     "DISARM_DELAY": 10.0,  # s
-    "FLTMODE1": 0.0,  # STABILIZE; FLTMODE1 to 6, the switch's positions, are this vehicle's choice
-    "FLTMODE2": 9.0,  # LAND
-    "FLTMODE3": 6.0,  # RTL
-    "FLTMODE4": 2.0,  # ALT_HOLD, at 1500 us
-    "FLTMODE5": 5.0,  # LOITER
-    "FLTMODE6": 17.0,  # BRAKE
-    "FLTMODE_CH": 5.0,  # channel of the switch; 0: none
+    "FLTMODE_CH": 5.0,  # stored only: no switch changes the mode
     "FS_GCS_ENABLE": 0.0,  # 0 off, 1 RTL, 5 LAND, 7 BRAKE
     "FS_GCS_TIMEOUT": 5.0,  # s
     "FS_OPTIONS": 16.0,  # bit 2: GUIDED continues; 3: a landing; 4: the pilot after GCS loss
     "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND, 7 BRAKE
-    "FS_THR_VALUE": 975.0,  # us
+    "FS_THR_VALUE": 975.0,  # us; stored only
     "GUID_OPTIONS": 0.0,  # bit 3: SET_ATTITUDE_TARGET.thrust is thrust, not a climb rate
     "GUID_TIMEOUT": 3.0,  # s until a setpoint is stale
     "LAND_SPEED": 50.0,  # cm/s
@@ -43,7 +37,7 @@ _FIXED = {
     "RCMAP_THROTTLE": 3.0,
     "RCMAP_YAW": 4.0,
     "RC_FS_TIMEOUT": 1.0,  # s
-    "RC_OPTIONS": 32.0,  # bit 0 ignore receiver, 1 ignore overrides, 6 no neutral-stick check
+    "RC_OPTIONS": 32.0,  # bit 0 ignore receiver, 1 ignore overrides
     "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
     "RTL_ALT": 1500.0,  # cm
     "SIMPLE": 0.0,  # stored only: the sticks keep the vehicle's axes

@@ -73,10 +73,6 @@ class RcEngine:
         """Return the zero-based channel of one of ``STICKS``, by RCMAP_* at boot."""
         return self._indices[axis]
 
-    @property
-    def throttle_us(self) -> int:
-        return self.channels_us[self.index_of("THROTTLE")]
-
     def sticks_us(self) -> tuple[int, int, int, int]:
         """Return the roll, pitch, throttle and yaw that the modes use [us], by RCMAP_*."""
         roll, pitch, throttle, yaw = (self.channels_us[self.index_of(axis)] for axis in STICKS)
@@ -125,8 +121,6 @@ class RcEngine:
 
 
 THROTTLE_FULL = 1000.0
-GESTURE_NS = 2 * NS_PER_S  # hold time: ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
-FULL_YAW = 4000 / 4500
 
 
 class Sticks(NamedTuple):
@@ -218,10 +212,3 @@ def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
         position = 0.5 + 0.5 * (sticks.throttle - mid) / (THROTTLE_FULL - mid)
     expo = max(-0.5, min(1.0, (0.5 - params["MOT_THST_HOVER"]) / 0.375))
     return max(0.0, min(1.0, position * (1.0 - expo) + expo * position**3))
-
-
-def gesture_side(sticks: Sticks) -> int:
-    """Return the side of the rudder gesture, throttle down and full yaw: 1 arms, -1 disarms."""
-    if sticks.throttle != 0.0 or abs(sticks.yaw) <= FULL_YAW:
-        return 0
-    return 1 if sticks.yaw > 0.0 else -1

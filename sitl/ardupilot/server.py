@@ -113,10 +113,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.follow_velocity(setpoint, ap.sensed, self._arrived_ns)
             self._log.setpoints += 1
 
-    def on_request_data_stream(self, link: ArduPilotEndpoint, message: Message) -> None:
-        rate_hz = message.req_message_rate if message.start_stop else 0
-        link.set_group(message.req_stream_id, rate_hz)
-
     def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         is_finite = all(map(math.isfinite, params[:2]))
         if not is_finite or not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import pygame
 
 from sitl.clock import Clock
-from sitl.pilot.transmitter import ARM, DISARM, Hand, PadAxes, Switch, Transmitter, pad_sticks
+from sitl.pilot.transmitter import Hand, PadAxes, Switch, Transmitter, pad_sticks
+from sitl.simulated_vehicle import SimulatedVehicle
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
 """A, B, back and start on a common pad."""
 PAD_HELP = (
-    "hold button 7 (start) to arm, 6 (back) to disarm; button 0 (A) moves the switch of channel 7 "
+    "button 7 (start) arms, 6 (back) disarms on the ground; 0 (A) moves the switch of channel 7 "
     "up and down, 1 (B) to its middle"
 )
 
@@ -32,14 +33,9 @@ class PygamePad:
         return f"{pad.get_name()}: {pad.get_numaxes()} axes, {pad.get_numbuttons()} buttons"
 
     def poll(self) -> bool:
-        for event in pygame.event.get():
-            is_ours = self._pad is not None and (
-                getattr(event, "instance_id", None) == self._pad.get_instance_id()
-            )
-            if event.type == pygame.JOYDEVICEREMOVED and is_ours:
-                self._pad = None
-        if self._pad is None and pygame.joystick.get_count():
-            self._pad = pygame.joystick.Joystick(0)
+        """Read the pad. Return False if there is none."""
+        pygame.event.clear()  # also looks for pads that come and go
+        self._pad = pygame.joystick.Joystick(0) if pygame.joystick.get_count() else None
         return self._pad is not None
 
     def axes(self) -> Sequence[float]:
@@ -56,14 +52,17 @@ class PygamePad:
 
 
 class GamepadPilot(Transmitter):
-    """`Pilot` at a gamepad: its sticks, gestures and switch.
+    """`Pilot` at a gamepad: its sticks, arming buttons and switch.
 
     Without the pad the receiver has no signal.
     """
 
-    def __init__(self, pad: PygamePad, axes: PadAxes, clock: Clock) -> None:
+    def __init__(
+        self, pad: PygamePad, axes: PadAxes, vehicle: SimulatedVehicle, clock: Clock
+    ) -> None:
         super().__init__(clock.now_ns)
         self._pad = pad
+        self._vehicle = vehicle
         self._axes = axes
         self._switch: Switch = "low"
         self._down: set[int] = set()
@@ -78,12 +77,11 @@ class GamepadPilot(Transmitter):
                 self._switch = "low" if self._switch == "high" else "high"
             elif number == BAD_BUTTON:
                 self._switch = "middle"
-        sticks = pad_sticks(self._axes, self._pad.axes())
-        if DISARM_BUTTON in self._down:
-            sticks = DISARM
-        if ARM_BUTTON in self._down:
-            sticks = ARM
-        return Hand(sticks, self._switch)
+            elif number == DISARM_BUTTON:
+                self._vehicle.ap.disarm(force=False)
+            elif number == ARM_BUTTON:
+                self._vehicle.ap.arm()
+        return Hand(pad_sticks(self._axes, self._pad.axes()), self._switch)
 
     def close(self) -> None:
         pygame.quit()

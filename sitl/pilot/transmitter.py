@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from sitl import UsageError
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
 from sitl.pilot.course_guide import CourseGuide
@@ -16,13 +18,7 @@ from sitl.simulated_vehicle import SimulatedVehicle
 OFF_US = (0,) * 8  # no signal from the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
 IDLE, DESCENT = (CENTRED._replace(throttle=throttle) for throttle in (-1.0, -0.8))
-ARM, DISARM = IDLE._replace(yaw=1.0), IDLE._replace(yaw=-1.0)
-"""Gestures that both firmwares understand."""
 _SWITCH_US = {"low": 1000, "middle": 1500, "high": 2000}
-_FIRST_MODE_US, _MODE_US = 1100, 1500
-"""The mode switch moves once after the start, because ArduPilot ignores its position until it
-moves. At 1500 us the simulated vehicle is in ALT_HOLD."""
-_MODE_AFTER_NS = NS_PER_S
 
 Switch = Literal["low", "middle", "high"]
 
@@ -55,8 +51,7 @@ class Transmitter(ABC):
         """Return the pilot's hand for the next frame; None: no signal."""
 
     def latest(self) -> Sequence[int] | None:
-        """Return the channels once for each frame: roll, pitch, throttle, yaw, mode, unused,
-        switch, unused."""
+        """Return the channels once for each frame: sticks, two unused, switch, unused."""
         now_ns = self._now_ns()
         if now_ns < self._due_ns:
             return None
@@ -65,10 +60,8 @@ class Transmitter(ABC):
         if (hand := self._hand(now_ns)) is None:
             return OFF_US
         throttle, yaw, pitch, roll = hand.sticks
-        is_begun = now_ns - self._start_ns < _MODE_AFTER_NS
-        mode_us = _FIRST_MODE_US if is_begun else _MODE_US
         sticks = (_us(roll), _us(-pitch), _us(throttle), _us(yaw))
-        return (*sticks, mode_us, 1500, _SWITCH_US[hand.switch], 1500)
+        return (*sticks, 1500, 1500, _SWITCH_US[hand.switch], 1500)
 
     def close(self) -> None:
         """Stop the input device, if any."""
@@ -119,7 +112,7 @@ def past_dead_zone(value: float) -> float:
 
 
 WAIT_NS = 8 * NS_PER_S
-"""Time from boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
+"""Time from boot to arming: the estimator needs 3 s for the attitude and 5 s for the
 position, and a recorder requests parameters and streams."""
 HOVER_NS = 2 * NS_PER_S  # after the last gate, before the landing
 
@@ -137,8 +130,9 @@ class ExpertPilot(Transmitter):
     def _hand(self, now_ns: int) -> Hand:
         ap = self._vehicle.ap
         if not ap.armed:
-            is_waiting = self._was_armed or now_ns - self._start_ns < WAIT_NS
-            return Hand(IDLE if is_waiting else ARM)
+            if not self._was_armed and now_ns - self._start_ns >= WAIT_NS:
+                ap.arm()
+            return Hand(IDLE)
         self._was_armed = True
         sticks = expert_sticks(self._guide, ap.truth, now_ns / NS_PER_S)
         if self._guide.next_gate is not None:
@@ -147,7 +141,9 @@ class ExpertPilot(Transmitter):
             self._over_course_ns = now_ns
         if now_ns - self._over_course_ns < HOVER_NS:
             return Hand(sticks)
-        return Hand(DISARM if ap.landed else DESCENT)
+        if ap.landed:
+            ap.disarm(force=False)
+        return Hand(DESCENT)
 
 
 PilotName = Literal["gamepad", "expert"]
@@ -158,10 +154,12 @@ _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
 
 def prepare_vehicle(vehicle: SimulatedVehicle) -> None:
     """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
-    if vehicle.ap.config.autopilot == "px4":
-        for name, value in _PX4_PARAMS.items():
-            vehicle.params.set(name, value)
-        vehicle.reboot()
+    if isinstance(vehicle.ap, ArduCopter):
+        vehicle.ap.set_mode(Mode.ALT_HOLD)
+        return
+    for name, value in _PX4_PARAMS.items():
+        vehicle.params.set(name, value)
+    vehicle.reboot()
 
 
 def make_pilot(
@@ -200,4 +198,4 @@ def make_pilot(
     except pygame.error as error:
         raise UsageError(f"--pilot gamepad needs a display: {error}") from error
     found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
-    return gamepad.GamepadPilot(pad, wanted, clock), f"{found}; {gamepad.PAD_HELP}"
+    return gamepad.GamepadPilot(pad, wanted, vehicle, clock), f"{found}; {gamepad.PAD_HELP}"

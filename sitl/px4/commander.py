@@ -17,7 +17,7 @@ from sitl.vehicle.firmware import Autopilot, Severity
 _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
-ArmReason = Literal["stick gesture", "external command", "landing", "auto preflight disarming"]
+DisarmReason = Literal["external command", "landing", "auto preflight disarming"]
 
 
 class Event(NamedTuple):
@@ -99,8 +99,7 @@ class Commander(Autopilot):
         """True if the vehicle's health allows arming; sticks may still be too high."""
         return self.estimator_ready and self.intended.armable and self.can_fly(self.intended)
 
-    def arm(self, reason: ArmReason = "external command") -> bool:
-        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
+    def arm(self) -> bool:
         if self.armed:
             return True
         if not self.can_arm():
@@ -121,7 +120,7 @@ class Commander(Autopilot):
             )
             return False
         self.start_motors(ignores_sticks=not self.stick_input.valid)
-        self._tell(f"Armed by {reason}", "commander_armed_by")
+        self._tell("Armed by external command", "commander_armed_by")
         return True
 
     def start_motors(self, *, ignores_sticks: bool) -> None:
@@ -130,8 +129,7 @@ class Commander(Autopilot):
         self._ignores_sticks = ignores_sticks
         self._sticks_missed = not self.stick_input.valid
 
-    def disarm(self, *, force: bool, reason: ArmReason = "external command") -> bool:
-        """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
+    def disarm(self, *, force: bool, reason: DisarmReason = "external command") -> bool:
         if not self.armed:
             return True
         if not (self.landed or force):
@@ -170,7 +168,6 @@ class Commander(Autopilot):
         self._tell(f"{what.capitalize()} detected", f"commander_{what}_detected")
 
     def _read_inputs(self) -> None:
-        self._read_gestures()
         if self.lost_sticks.update(self.step_ns):
             self._say_failsafe()
         if self.now_ns >= self._check_due_ns:
@@ -180,15 +177,6 @@ class Commander(Autopilot):
             self._yield_to_pilot()
             self._disarm_by_time()
         self._choose_mode()
-
-    def _read_gestures(self) -> None:
-        gesture = self.stick_input.gesture.take(self.now_ns)
-        if not gesture or not self.params.integer("MAN_ARM_GESTURE"):
-            return
-        if gesture > 0:
-            self.arm("stick gesture")
-        elif self.landed:
-            self.disarm(force=False, reason="stick gesture")
 
     def _watch_sticks(self) -> None:
         """Start the failsafe if sticks are lost in flight; sticks absent at arming are ignored."""

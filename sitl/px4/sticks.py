@@ -1,4 +1,4 @@
-"""Stick input: choice between senders, loss, gestures, a pilot's takeover, and stick curves.
+"""Stick input: choice between senders, loss, a pilot's takeover, and stick curves.
 
 PX4 has no overrides: each link, and the receiver, is a source. COM_RC_IN_MODE selects which source
 may win, and the winner's last values hold until it is declared lost. Timers and limits are those
@@ -12,14 +12,11 @@ from typing import NamedTuple
 from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.vehicle.dynamics import GRAVITY_MPS2
-from sitl.vehicle.firmware import Held
 from sitl.vehicle.rotation import length
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
 """Sticks are checked at each arrival and, without one, at this period."""
-GESTURE_NS = NS_PER_S
-GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW, GESTURE_MOST_LEAN = -0.9, 0.9, 0.3
 FAST_SAMPLES = 3
 """1.18: consecutive movements in one direction that count as a pilot's (MIN_SIGN_CONSECUTIVE).
 Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
@@ -93,8 +90,6 @@ class StickInput:
         self._never_ages = False
         self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         self._looked_ns = 0
-        self.gesture = Held(GESTURE_NS)
-        """Arming gesture (throttle down, full right yaw, no lean) and disarming (full left yaw)."""
 
     @property
     def source(self) -> int | None:
@@ -120,7 +115,6 @@ class StickInput:
                 self.on_sticks(source, sticks, now_ns)
             if not self.valid:
                 self.moved_fast = False
-                self.gesture.see(0, now_ns)
                 self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         if self.valid and now_ns - self._looked_ns >= POLL_NS:
             self._look(now_ns)
@@ -159,12 +153,6 @@ class StickInput:
         self._look(now_ns)
         self._never_ages = False
         self.count += 1
-        side = 0
-        is_level = max(abs(sticks.forward), abs(sticks.right)) < GESTURE_MOST_LEAN
-        is_turned = abs(sticks.yaw) > GESTURE_FULL_YAW
-        if is_level and is_turned and sticks.throttle < GESTURE_LOW_THROTTLE:
-            side = 1 if sticks.yaw > 0.0 else -1
-        self.gesture.see(side, now_ns)
 
 
 def curve(value: float, dead_zone: float) -> float:

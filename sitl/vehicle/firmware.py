@@ -56,7 +56,7 @@ class VelocitySetpoint(NamedTuple):
 
 
 class Held:
-    """Stick gesture or switch whose position, not 0, acts once after it was held."""
+    """Switch whose position, not 0, acts once after it was held."""
 
     def __init__(self, hold_ns: int) -> None:
         self._hold_ns = hold_ns
@@ -276,6 +276,14 @@ class Autopilot(ABC):
         self._start_in_air()
 
     @abstractmethod
+    def arm(self) -> bool:
+        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
+
+    @abstractmethod
+    def disarm(self, *, force: bool) -> bool:
+        """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
+
+    @abstractmethod
     def _read_inputs(self) -> None:
         """Read sticks and setpoints, and decide on mode and arming."""
 
@@ -301,14 +309,12 @@ class Autopilot(ABC):
         body = self.sensed
         is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
         is_still = body.touching and is_slow and not (self.armed and self._is_pushing)
-        self._still_since_ns = self._since(self._still_since_ns, is_still)
+        if not is_still:
+            self._still_since_ns = None
+        elif self._still_since_ns is None:
+            self._still_since_ns = self.now_ns
         if not self.landed and self._has_held(self._still_since_ns, LANDED_AFTER_NS):
             self._set_landed(landed=True)
-
-    def _since(self, since_ns: int | None, condition: bool) -> int | None:
-        if not condition:
-            return None
-        return self.now_ns if since_ns is None else since_ns
 
     def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
         return since_ns is not None and self.now_ns - since_ns >= duration_ns

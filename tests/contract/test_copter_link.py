@@ -56,15 +56,6 @@ def test_unknown_messages_are_denied(companion, message_id):
     assert companion.stream(message_id, 10) == DENIED
 
 
-def test_data_streams_overrule_intervals(companion):
-    companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-    companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 25, 1))
-    companion.advance(0.1)
-    attitudes = named(companion.advance(1.0), "ATTITUDE")
-    companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 0, 0))
-    assert rate_hz(attitudes, 1.0) == pytest.approx(25.0, rel=0.05)
-
-
 def test_unknown_commands_are_unsupported(companion):
     assert companion.command(65_000) == UNSUPPORTED
 

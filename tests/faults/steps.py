@@ -255,14 +255,11 @@ def duplicate_system(stage: Stage, *, s: float, hz: float = 10.0) -> int:
 
 
 def rates(stage: Stage, *, hz: float, names: Sequence[str]) -> int:
-    """Request few messages as a ground station, by interval and ArduPilot's data streams."""
+    """Request few messages as a ground station."""
     relay, began_ns = stage.relay, stage.clock.now_ns()
     for name in names:
         number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
         relay.command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / hz)
-    if not stage.is_px4:
-        every = dialect.MAV_DATA_STREAM_ALL
-        relay.inject(dialect.MAVLink_request_data_stream_message(*VEHICLE, every, round(hz), 1))
     return began_ns
 
 

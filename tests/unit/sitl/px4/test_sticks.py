@@ -1,4 +1,4 @@
-"""Choice and loss of PX4's stick input, and its gestures."""
+"""Choice and loss of PX4's stick input."""
 
 import pytest
 
