@@ -133,10 +133,8 @@ def make_course(seed: int, laps: int = 1) -> Course:
     are flown ``laps`` times. A gate faces the mean of the legs before and after it.
 
     Raises:
-        UsageError: the seed is negative, or the course is no loop and has several laps.
+        UsageError: the course is no loop and has several laps.
     """
-    if seed < 0:
-        raise UsageError(f"a course seed is 0 or more, got {seed}")
     if seed >= LOOP_SEEDS:
         return _make_loop(seed, laps)
     if laps != 1:

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.scenery import FloatArray, Image
 from sitl.course import Course
@@ -53,8 +52,6 @@ class FpvRenderer:
     def __init__(
         self, course: Course, width: int, height: int, conditions: Conditions = NOMINAL
     ) -> None:
-        if min(width, height) < 16:
-            raise UsageError(f"the image must have at least 16x16 pixels, got {width}x{height}")
         self._focal_px = width / 2 / math.tan(conditions.horizontal_fov_rad / 2)
         self._center_px = np.array([(width - 1) / 2, (height - 1) / 2])
         u_px, v_px = self._center_px

@@ -27,8 +27,6 @@ class FramePublisher:
     """Publishes RGB or depth frames of one size under a name, from one thread."""
 
     def __init__(self, name: str, width: int, height: int, *, is_depth: bool = False) -> None:
-        if min(width, height) < 1:
-            raise UsageError(f"a frame needs at least one pixel, got {width}x{height}")
         if not name or "/" in name or name.startswith("."):
             raise UsageError(f"shm:{name}: want a name such as fpv, without '/' or a leading '.'")
         folder = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory

@@ -14,7 +14,6 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from sitl import UsageError
 from sitl.vehicle.rotation import Vec3
 
 T = TypeVar("T")
@@ -133,13 +132,7 @@ NOMINAL = Conditions()
 
 
 def random_conditions(seed: int) -> Conditions:
-    """Draw the conditions of this seed; they are the same on every machine.
-
-    Raises:
-        UsageError: a negative seed.
-    """
-    if seed < 0:
-        raise UsageError(f"a conditions seed is 0 or more, got {seed}")
+    """Draw the conditions of this seed; they are the same on every machine."""
     conditions = replace(NOMINAL, seed=seed)
     draw = Draw(np.random.Generator(np.random.PCG64(seed)))
     for vary in _VARIATIONS:

@@ -6,7 +6,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from sitl import UsageError
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
@@ -144,14 +143,6 @@ def test_conditions_that_hide_gates_change_the_picture(name):
     usual = replace(NOMINAL, sun_ned=(1.0, 0.0, -0.2), seed=2)
     changed = render(replace(usual, **{name: 1.0})).astype(int)
     assert np.abs(changed - render(usual)).mean() > 0.5
-
-
-@pytest.mark.parametrize(
-    "draw", [random_conditions, held_out_conditions, training_conditions, unseen_conditions]
-)
-def test_a_negative_seed_is_refused(draw):
-    with pytest.raises(UsageError):
-        draw(-1)
 
 
 def test_the_wind_carries_a_level_vehicle_along():
