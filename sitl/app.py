@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, next_slot_ns, stop_on_signal, wall_ns
 from sitl.course import LOOP_SEEDS, Course, course_to_json, make_course
 from sitl.link.transport import RcInput, Transport, open_transport
-from sitl.pilot.transmitter import DEFAULT_AXES, PILOTS, Pilot, make_pilot, prepare_vehicle
+from sitl.pilot.transmitter import DEFAULT_AXES, PILOTS, Transmitter, make_pilot, prepare_vehicle
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import (
@@ -45,7 +46,7 @@ def fly(
     stop: StopRequest,
     end_ns: int | None,
     *,
-    rc_input: Pilot | None = None,
+    rc_input: RcInput | Transmitter | None = None,
 ) -> None:
     """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send due messages.
 
@@ -56,7 +57,6 @@ def fly(
     while not stop.is_set() and (end_ns is None or due_ns < end_ns):
         for link_id, transport in enumerate(transports):
             for received in transport.drain():
-                status.on_received(link_id)
                 vehicle.receive(link_id, received.data, received.arrived_ns)
         if rc_input is not None and (values_us := rc_input.latest()) is not None:
             vehicle.set_receiver(values_us)
@@ -87,19 +87,13 @@ def print_status(line: str) -> None:
 
 
 class _Status:
-    """Prints changes: connections, mode, arming and the vehicle's texts."""
+    """Prints changes: mode, arming and the vehicle's texts."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
-        self._connected: set[int] = set()
         self._mode = vehicle.ap.mode_name
         self._armed = vehicle.ap.armed
         self._texts = len(vehicle.log.texts)
-
-    def on_received(self, link_id: int) -> None:
-        if link_id not in self._connected:
-            self._connected.add(link_id)
-            print_status(f"link {link_id} connected")
 
     def print_changes(self) -> None:
         ap, log = self._vehicle.ap, self._vehicle.log
@@ -126,14 +120,12 @@ def filming(
     An error in the thread stops the flight, and is raised at the end of the block.
     """
     stop = threading.Event()
-    errors: list[Exception] = []
     size = (camera.image_size, camera.image_size)
     renderer = FpvRenderer(course, *size, vehicle.ap.config.conditions)
-    publisher = FramePublisher(camera.shm_name, *size)
     period_ns = round(NS_PER_S / camera.fps)
     to_end_ns = round(vehicle.ap.config.conditions.frame_time_s / 2 * NS_PER_S)
 
-    def film() -> None:
+    def film(publisher: FramePublisher) -> None:
         due_ns = clock.now_ns()
         while not stop.wait(max(0, due_ns - clock.now_ns()) / NS_PER_S):
             pose = vehicle.pose
@@ -145,23 +137,17 @@ def filming(
             publisher.publish(image, pose.stamp_ns)
             due_ns = next_slot_ns(due_ns, period_ns, clock.now_ns())
 
-    def film_or_stop() -> None:
+    with (
+        closing(FramePublisher(camera.shm_name, *size)) as publisher,
+        ThreadPoolExecutor(1, "sitl-camera") as pool,
+    ):
+        filmed = pool.submit(film, publisher)
+        filmed.add_done_callback(lambda _: flight_stop.set())
         try:
-            film()
-        except Exception as error:  # noqa: BLE001 - raised again by the main thread
-            errors.append(error)
-            flight_stop.set()
-
-    thread = threading.Thread(target=film_or_stop, name="sitl-camera", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(JOIN_TIMEOUT_S)
-        publisher.close()
-    if errors:
-        raise errors[0]
+            yield
+        finally:
+            stop.set()
+        filmed.result(JOIN_TIMEOUT_S)
 
 
 def run(argv: Sequence[str] | None = None) -> int:
@@ -202,7 +188,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--pilot", choices=PILOTS, help=pilot_help)
     axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
     add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
-    add("--pilot-speed", type=_SPEED, default=4.0, metavar="MPS", help="of the expert")
     key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
     add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
     _add_camera_flags(parser)
@@ -257,13 +242,14 @@ def _fly(args: argparse.Namespace) -> None:
         vehicle = SimulatedVehicle(
             links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
         )
-        rc_input: Pilot | None = None
+        rc_input: RcInput | Transmitter | None = None
         if args.rc_in is not None:
             rc_input = stack.enter_context(closing(RcInput(args.rc_in)))
         if args.pilot is not None:
             prepare_vehicle(vehicle)
-            pilot = (args.pilot, args.pilot_axes, args.pilot_speed)
-            rc_input, line = make_pilot(*pilot, vehicle=vehicle, course=course, clock=clock)
+            rc_input, line = make_pilot(
+                args.pilot, args.pilot_axes, vehicle=vehicle, course=course, clock=clock
+            )
             stack.enter_context(closing(rc_input))
             print_status(line)
         stop = stack.enter_context(stop_on_signal())
@@ -358,7 +344,6 @@ def _number(
 
 _SECONDS = _number(float, sys.float_info.min, 1e6, "a positive number of seconds, at most 1e6")
 _FPS = _number(float, 0.1, 1000, "0.1 to 1000 Hz")
-_SPEED = _number(float, 0.1, 100, "0.1 to 100 m/s")
 _SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
 _LAPS = _number(int, 1, 10_000, "a number of laps, 1 to 10000")
 _PORT = _number(int, 1, 65535, "a port, 1 to 65535")

@@ -43,8 +43,7 @@ class StopRequest:
     Not a ``threading.Event``: a second signal's handler would wait for the first one's lock.
     """
 
-    def __init__(self) -> None:
-        self._is_set = False
+    _is_set = False
 
     def set(self) -> None:
         self._is_set = True

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 from sitl.clock import NS_PER_S
 from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
 from sitl.vehicle.firmware import Autopilot
-from sitl.vehicle.rotation import Vec3, cos_tilt, to_euler
+from sitl.vehicle.rotation import Vec3, cos_tilt
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
@@ -143,8 +143,6 @@ class FlightLog:
             self.crash = Crash(t_s=self._t_s(now_ns), hit=hit, speed_mps=self._speed_mps)
 
     def summary(self, ap: Autopilot) -> dict[str, Any]:
-        body = ap.truth
-        angles = to_euler(body.ned_from_body_wxyz)
         passed = [asdict(gate) for gate in self._gates.passed]
         return {
             "start_ns": self._start_ns,
@@ -167,9 +165,7 @@ class FlightLog:
                 "mode": ap.mode_name,
                 "armed": ap.armed,
                 "landed": ap.landed,
-                "position_ned_m": body.position_ned_m,
-                "velocity_ned_mps": body.velocity_ned_mps,
-                "roll_pitch_yaw_deg": [math.degrees(angle) for angle in angles],
+                "position_ned_m": ap.truth.position_ned_m,
             },
             "sticks": list(self._sticks.rows),
         }

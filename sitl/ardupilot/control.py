@@ -122,7 +122,8 @@ class AttitudeController:
 
         ``wanted_radps`` is the rate at which the wanted angle itself turns.
         """
-        input_time_s = max(MIN_INPUT_TIME_S, self._params.decimal("ATC_INPUT_TC"))
+        as_decimal = float(f"{self._params['ATC_INPUT_TC']:.7g}")  # 0.15, not 0.1500000059
+        input_time_s = max(MIN_INPUT_TIME_S, as_decimal)
         max_rate_radps = math.radians(self._limit(f"ATC_RATE_{axis}_MAX"))
         wanted = clamp(error_rad / input_time_s + wanted_radps, max_rate_radps)
         return self.slew(axis, wanted, rate_radps)

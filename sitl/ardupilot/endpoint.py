@@ -1,8 +1,7 @@
 """One link of an ArduPilot vehicle: its messages and their intervals.
 
-As in the firmware, intervals are rounded and capped. Units and oddities are those measured on
-ArduCopter 4.7: a magnetometer in HIGHRES_IMU that is a million times too large, positions withheld
-until the estimator has one.
+As measured on ArduCopter 4.7, intervals are rounded and capped, and positions are withheld until
+the estimator has one.
 """
 
 import numpy as np
@@ -38,9 +37,6 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
     """ArduPilot's messages, at the default home of its SITL."""
 
     lat_deg, lon_deg, alt_m = -35.3632621, 149.1652374, 584.0
-    field_ned_gauss = (0.2322, 0.0520, -0.5280)
-    field_per_gauss = 1e6  # in micro-gauss, as in the firmware
-    pressure_hpa, temperature_c = 945.0, 35.0
     capabilities = flags(
         "MAV_PROTOCOL_CAPABILITY_",
         "PARAM_FLOAT MISSION_INT COMMAND_INT MAVLINK2 SET_ATTITUDE_TARGET "
@@ -133,21 +129,11 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS)
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
-        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
-
-        A refusal keeps the old interval and is sent as a text.
-        """
+        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default."""
         interval_ms = max(1, min(interval_us, MAX_INTERVAL_US) // 1000) if interval_us > 0 else 0
         if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             interval_ms = HEARTBEAT_INTERVAL_MS
-        refusal = None
-        if message_id not in self._telemetry.names:
-            refusal = f"No ap_message for mavlink id ({message_id})"
-        elif 0 < interval_ms < SHORTEST_INTERVAL_MS:
-            refusal = f"Requested rate for message ID {message_id} too fast. "
-            refusal += "Increase SCHED_LOOP_RATE"
-        if refusal is not None:
-            self.send_text(mav.MAV_SEVERITY_INFO, refusal)
+        if message_id not in self._telemetry.names or 0 < interval_ms < SHORTEST_INTERVAL_MS:
             return False
         self._start(message_id, interval_ms)
         return True

@@ -92,7 +92,3 @@ class ArduPilotParams(Params):
         if is_old:
             del values["MAV_GCS_SYSID_HI"]
         super().__init__(values, renamed=_NAMES_4_6 if is_old else {})
-
-    def decimal(self, name: str) -> float:
-        """Return the value rounded to the seven digits of a float32: 0.15, not 0.1500000059."""
-        return float(f"{self._values[name]:.7g}")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
-from sitl.vehicle.firmware import Held, Receiver
+from sitl.vehicle.firmware import Receiver
 
 STICKS = ("ROLL", "PITCH", "THROTTLE", "YAW")
 CHANNELS = 16
@@ -41,8 +41,8 @@ class RcEngine:
         self._override_us = [RELEASE] * CHANNELS
         self._override_ns = [0] * CHANNELS
         self._fresh_override = self._was_overridden = False
-        self._switch = Held(DEBOUNCE_NS)  # RCn_OPTION 46: 1 high, -1 low
-        self._switch_due_ns = 0
+        self._switch = 0  # RCn_OPTION 46: 1 high, -1 low
+        self._switch_since_ns = self._switch_due_ns = 0
         self._takes_overrides = True
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
@@ -113,11 +113,13 @@ class RcEngine:
             return
         self._switch_due_ns = now_ns + _SWITCH_PERIOD_NS
         pwm_us = self.channels_us[switches[0] - 1]
-        self._switch.see((1800 < pwm_us < 2200) - (900 < pwm_us < 1200), now_ns)
-        if side := self._switch.take(now_ns):
+        side = (1800 < pwm_us < 2200) - (900 < pwm_us < 1200)
+        if side != self._switch:
+            self._switch, self._switch_since_ns = side, now_ns
+        if side and now_ns - self._switch_since_ns >= DEBOUNCE_NS:
             self._takes_overrides = side > 0
-        if side < 0:
-            self.clear_overrides()
+            if not self._takes_overrides:
+                self.clear_overrides()
 
 
 THROTTLE_FULL = 1000.0

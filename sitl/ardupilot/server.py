@@ -42,7 +42,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
     """ArduPilot's messages and commands."""
 
     bad_interval, unknown_message = DENIED, FAILED
-    zero_interval_params = (2,)
 
     def __init__(self, ap: ArduCopter, link_count: int, log: FlightLog) -> None:
         super().__init__(ap, [ArduPilotEndpoint(ap) for _ in range(link_count)], log)

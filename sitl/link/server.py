@@ -141,15 +141,13 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
     """Receives on all links of one vehicle, and acts on the messages.
 
     ``on_NAME`` handles a message, given the link and the message. ``cmd_NAME`` handles a command,
-    given its parameters and the link; it returns the MAV_RESULT of the ack, or None for no ack.
+    given its parameters and the link; it returns the MAV_RESULT of the ack.
     """
 
     bad_interval: ClassVar[int]
     """MAV_RESULT for an invalid message number or interval."""
     unknown_message: ClassVar[int]
     """MAV_RESULT for a request of an unknown message."""
-    zero_interval_params: ClassVar[tuple[int, ...]]
-    """Indices of the parameters of SET_MESSAGE_INTERVAL that must be 0."""
 
     def __init__(self, ap: Ap, links: Sequence[Link], log: FlightLog) -> None:
         self.links = tuple(links)
@@ -187,23 +185,17 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
     def _announce(self) -> None:
         """Queue messages that precede the texts."""
 
-    def _execute(self, message: Message, params: Params7, link: Link) -> int | None:
-        """Execute a command. Return the MAV_RESULT for its ack, or None for no ack."""
+    def on_command_long(self, link: Link, message: Message) -> None:
         entry = mav.enums["MAV_CMD"].get(message.command)
         name = entry.name.lower().removeprefix("mav_") if entry else ""
-        handler: Callable[[Params7, Link], int | None] | None = getattr(self, name, None)
-        return UNSUPPORTED if handler is None else handler(params, link)
-
-    def on_command_long(self, link: Link, message: Message) -> None:
+        handler: Callable[[Params7, Link], int] | None = getattr(self, name, None)
         params = tuple(float(getattr(message, f"param{n}")) for n in range(1, 8))
-        result = self._execute(message, params, link)
-        if result is not None:
-            sender = (message.get_srcSystem(), message.get_srcComponent())
-            link.send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
+        result = UNSUPPORTED if handler is None else handler(params, link)
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        link.send(mav.MAVLink_command_ack_message(message.command, result, 0, 0, *sender))
 
     def cmd_set_message_interval(self, params: Params7, link: Link) -> int:
-        is_plain = all(params[index] == 0.0 for index in self.zero_interval_params)
-        if not is_plain or not all(map(math.isfinite, params[:2])):
+        if not all(map(math.isfinite, params[:2])):
             return self.bad_interval
         is_set = link.set_interval(int(params[0]), int(params[1]))
         return ACCEPTED if is_set else self.bad_interval

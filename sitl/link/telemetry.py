@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.vehicle.firmware import Autopilot
-from sitl.vehicle.rotation import Vec3, conjugate, rotate, to_euler
+from sitl.vehicle.rotation import to_euler
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 Fields: TypeAlias = tuple[Any, ...]
@@ -15,7 +15,7 @@ Ap = TypeVar("Ap", bound=Autopilot)
 METRES_PER_DEGREE = 111_319.5
 FULL_PERCENT = 100  # of the battery, which never empties
 INT16 = 32767
-_IMU_FIELDS_UPDATED = 0x1FFF
+_IMU_FIELDS_UPDATED = 0x3F
 
 
 def flags(prefix: str, names: str) -> int:
@@ -36,10 +36,6 @@ class Telemetry(Generic[Ap]):
     lat_deg: ClassVar[float]  # of the simulator's origin
     lon_deg: ClassVar[float]
     alt_m: ClassVar[float]  # above mean sea level
-    field_ned_gauss: ClassVar[Vec3]  # magnetic field of the earth
-    field_per_gauss: ClassVar[float] = 1.0  # unit of the field in HIGHRES_IMU
-    pressure_hpa: ClassVar[float]  # air pressure at the origin
-    temperature_c: ClassVar[float]
     capabilities: ClassVar[int]  # MAV_PROTOCOL_CAPABILITY
 
     def __init__(self, ap: Ap) -> None:
@@ -91,15 +87,10 @@ class Telemetry(Generic[Ap]):
         return (self.boot_ms, *place, *velocity_cmps, nose_cdeg)
 
     def highres_imu(self) -> Fields:
-        """In m/s^2, rad/s and the firmware's unit of the field."""
-        height_m = -self.ap.sensed.position_ned_m[2]
-        pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
-        air = (pressure, 0.0, self.alt_m + height_m, self.temperature_c)
-        body = self.ap.sensed
-        field_gauss = rotate(conjugate(body.ned_from_body_wxyz), self.field_ned_gauss)
-        field = (self.field_per_gauss * gauss for gauss in field_gauss)
-        imu = (*body.specific_force_body_mps2, *body.rate_body_radps, *field)
-        return (self.boot_us, *imu, *air, _IMU_FIELDS_UPDATED, 0)
+        """Accelerometer and gyro; without a magnetometer and a barometer."""
+        body, none = self.ap.sensed, [0.0] * 7
+        imu = (*body.specific_force_body_mps2, *body.rate_body_radps)
+        return (self.boot_us, *imu, *none, _IMU_FIELDS_UPDATED, 0)
 
     def autopilot_version(self) -> Fields:
         return (self.capabilities, self.version, 0, 0, 0, *[[0] * 8] * 3, 0, 0, self.ap.system_id)

@@ -52,7 +52,7 @@ class PygamePad:
 
 
 class GamepadPilot(Transmitter):
-    """`Pilot` at a gamepad: its sticks, arming buttons and switch.
+    """Pilot at a gamepad: its sticks, arming buttons and switch.
 
     Without the pad the receiver has no signal.
     """

@@ -4,7 +4,7 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from sitl import UsageError
 from sitl.ardupilot.autopilot import ArduCopter
@@ -13,6 +13,8 @@ from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
 from sitl.pilot.course_guide import CourseGuide
 from sitl.pilot.demonstrator import CENTRED, STICK_AGILITY, StickPositions, expert_sticks
+from sitl.px4.autopilot import Px4
+from sitl.px4.modes import Px4Mode
 from sitl.simulated_vehicle import SimulatedVehicle
 
 OFF_US = (0,) * 8  # no signal from the transmitter
@@ -30,17 +32,8 @@ class Hand(NamedTuple):
     switch: Switch = "low"
 
 
-class Pilot(Protocol):
-    """Source of receiver values. The vehicle's loop polls it; it never waits."""
-
-    def latest(self) -> Sequence[int] | None:
-        """Return the channels [us] for ``Receiver.move``; None: unchanged."""
-
-    def close(self) -> None: ...
-
-
 class Transmitter(ABC):
-    """`Pilot` that converts a hand to channels at a receiver's frame rate."""
+    """Source of receiver values: converts a hand to channels at a receiver's frame rate."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
@@ -115,15 +108,16 @@ WAIT_NS = 8 * NS_PER_S
 """Time from boot to arming: the estimator needs 3 s for the attitude and 5 s for the
 position, and a recorder requests parameters and streams."""
 HOVER_NS = 2 * NS_PER_S  # after the last gate, before the landing
+EXPERT_MPS = 5.0
 
 
 class ExpertPilot(Transmitter):
     """One flight of the expert over the course, with the switch high up to the last gate."""
 
-    def __init__(self, vehicle: SimulatedVehicle, course: Course, *, speed_mps: float) -> None:
+    def __init__(self, vehicle: SimulatedVehicle, course: Course) -> None:
         super().__init__(lambda: vehicle.ap.now_ns)
         self._vehicle = vehicle
-        self._guide = CourseGuide(course, STICK_AGILITY, speed_mps)
+        self._guide = CourseGuide(course, STICK_AGILITY, EXPERT_MPS)
         self._was_armed = False
         self._over_course_ns: int | None = None
 
@@ -148,32 +142,28 @@ class ExpertPilot(Transmitter):
 
 PilotName = Literal["gamepad", "expert"]
 PILOTS: tuple[PilotName, ...] = ("gamepad", "expert")
-_PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
-"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
 
 
 def prepare_vehicle(vehicle: SimulatedVehicle) -> None:
     """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
     if isinstance(vehicle.ap, ArduCopter):
         vehicle.ap.set_mode(Mode.ALT_HOLD)
-        return
-    for name, value in _PX4_PARAMS.items():
-        vehicle.params.set(name, value)
-    vehicle.reboot()
+    elif isinstance(vehicle.ap, Px4):
+        vehicle.params.set("COM_RC_IN_MODE", 0.0)  # sticks from the receiver alone
+        vehicle.ap.set_mode(Px4Mode.ALTCTL)
 
 
 def make_pilot(
     name: PilotName,
     axes: str,
-    speed_mps: float,
     *,
     vehicle: SimulatedVehicle,
     course: Course,
     clock: Clock,
-) -> tuple[Pilot, str]:
+) -> tuple[Transmitter, str]:
     """Return the pilot and a line about it for the user.
 
-    ``axes`` are a gamepad's, in the format of `parse_axes`, and ``speed_mps`` is the expert's.
+    ``axes`` are a gamepad's, in the format of `parse_axes`.
 
     Raises:
         UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
@@ -181,8 +171,7 @@ def make_pilot(
     if name == "expert":
         if vehicle.ap.config.autopilot != "ardupilot":
             raise UsageError("--pilot expert knows the sticks of ardupilot alone")
-        expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
-        return expert, f"the expert flies at {speed_mps:g} m/s"
+        return ExpertPilot(vehicle, course), f"the expert flies at {EXPERT_MPS:g} m/s"
     wanted = parse_axes(axes)
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no banner on import
     try:

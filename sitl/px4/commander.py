@@ -42,9 +42,6 @@ CHECK_PERIOD_NS = 20 * NS_PER_MS
 LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
 """Highest throttle for arming in modes where the stick is thrust, and where it is a climb rate."""
 
-_BOOT_MODES = {1: Px4Mode.ALTCTL, 2: Px4Mode.POSCTL}
-"""Modes of COM_FLTMODE_BOOT; 4, and any mode that this vehicle lacks, means Hold."""
-
 
 class Commander(Autopilot):
     """Decides on mode and arming during one boot; texts and events wait in lists for the links."""
@@ -53,8 +50,7 @@ class Commander(Autopilot):
 
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
-        boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Px4Mode.AUTO_LOITER)
-        self.mode = self.intended = self._last_armable = boot_mode
+        self.mode = self.intended = self._last_armable = Px4Mode.AUTO_LOITER
         self.stick_input = StickInput(params)
         self.lost_sticks = LostSticks(params)
         self.events: list[Event] = []  # events to send; the reader empties the list
@@ -143,15 +139,12 @@ class Commander(Autopilot):
         self.mode = self.intended
         return True
 
-    def set_mode(self, mode: Px4Mode, *, says_why: bool = True) -> bool:
+    def set_mode(self, mode: Px4Mode) -> bool:
         """Take a commanded mode. Return True if it is the intended one afterwards.
 
-        A refusal becomes a text if ``says_why``.
+        The firmware also sends a refusal as a text, but not to a companion computer.
         """
         if self.armed and mode is not Px4Mode.AUTO_LAND and not self.can_fly(mode):
-            text = f"Switching to {mode.spoken} is currently not available"
-            if says_why:
-                self._deny(text, "commander_modeswitch_not_avail")
             return False
         self._intend(mode)
         return True

@@ -55,8 +55,6 @@ class Px4Telemetry(Telemetry[Px4]):
     """PX4's messages, at the default home of its SIH."""
 
     lat_deg, lon_deg, alt_m = 47.397743, 8.545594, 489.4
-    field_ned_gauss = (0.215, 0.0118, 0.4307)
-    pressure_hpa, temperature_c = 955.6, 25.0
     capabilities = 0xE8FF
     dialect = mav
 
@@ -67,8 +65,6 @@ class Px4Telemetry(Telemetry[Px4]):
     def heartbeat(self) -> Fields:
         """Once a second, so a short change, even an arming, may never show."""
         ap, base_mode = self.ap, self.ap.mode.base_flags
-        if ap.mode is Px4Mode.OFFBOARD and isinstance(ap.setpoint, VelocitySetpoint):
-            base_mode |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
         if ap.armed:
             base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
         if ap.in_failsafe:
@@ -146,17 +142,8 @@ class Px4Telemetry(Telemetry[Px4]):
         return (mav.MAV_VTOL_STATE_MC, state)
 
 
-_SLOW_TOPICS = (
-    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
-)
-
-
 def topic_version(message_id: int, ap: Px4) -> Hashable:
     """Return a value that changes with each new sample of the topic; it bounds a stream's rate."""
-    if message_id in _SLOW_TOPICS:
-        return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
         sends_attitude = ap.mode is Px4Mode.OFFBOARD and not isinstance(
             ap.setpoint, VelocitySetpoint

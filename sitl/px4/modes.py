@@ -13,21 +13,21 @@ MAIN_AUTO = 4
 class Px4Mode(Enum):
     """Flight mode.
 
-    Values: main and sub mode of HEARTBEAT.custom_mode, name in status texts, MAV_STANDARD_MODE.
+    Values: main and sub mode of HEARTBEAT.custom_mode, MAV_STANDARD_MODE.
     """
 
-    MANUAL = (1, 0, "Manual", 0)
-    ALTCTL = (2, 0, "Altitude", 4)
-    POSCTL = (3, 0, "Position", 1)
-    AUTO_TAKEOFF = (4, 2, "Takeoff", 8)
-    AUTO_LOITER = (4, 3, "Hold", 0)
-    AUTO_RTL = (4, 5, "RTL", 5)
-    AUTO_LAND = (4, 6, "Land", 7)
-    OFFBOARD = (6, 0, "Offboard", 0)
-    STAB = (7, 0, "Stabilized", 0)
+    MANUAL = (1, 0, 0)
+    ALTCTL = (2, 0, 4)
+    POSCTL = (3, 0, 1)
+    AUTO_TAKEOFF = (4, 2, 8)
+    AUTO_LOITER = (4, 3, 0)
+    AUTO_RTL = (4, 5, 5)
+    AUTO_LAND = (4, 6, 7)
+    OFFBOARD = (6, 0, 0)
+    STAB = (7, 0, 0)
 
-    def __init__(self, main: int, sub: int, spoken: str, standard: int) -> None:
-        self.main, self.sub, self.spoken, self.standard = main, sub, spoken, standard
+    def __init__(self, main: int, sub: int, standard: int) -> None:
+        self.main, self.sub, self.standard = main, sub, standard
         self.custom_mode = main << 16 | sub << 24
         self.is_auto = main == MAIN_AUTO
         self.manual_throttle = main in (1, 7)  # the stick is thrust: down for arming
@@ -41,7 +41,7 @@ class Px4Mode(Enum):
             flags |= mav.MAV_MODE_FLAG_GUIDED_ENABLED | mav.MAV_MODE_FLAG_AUTO_ENABLED
             flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
         self.base_flags = int(flags)
-        """MAV_MODE_FLAG bits of the heartbeat, without the armed and OFFBOARD's setpoint bit."""
+        """MAV_MODE_FLAG bits of the heartbeat, without the armed bit."""
 
     @property
     def label(self) -> str:

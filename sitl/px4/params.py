@@ -23,7 +23,7 @@ _INTEGERS: Mapping[str, int] = MappingProxyType(
         "RC_MAP_PITCH": 0,  # channel from 1; 0: not mapped
         "SYS_AUTOSTART": 10040,  # SIH quadrotor
     }
-    | {"COM_FLTMODE_BOOT": 4, "MAN_ARM_GESTURE": 1, "MAV_COMP_ID": 1, "MAV_SYS_ID": 1}
+    | {"MAN_ARM_GESTURE": 1, "MAV_COMP_ID": 1, "MAV_SYS_ID": 1}
     | {"MAV_TYPE": 2, "MPC_THR_CURVE": 0, "RC_MAP_ROLL": 0, "RC_MAP_THROTTLE": 0, "RC_MAP_YAW": 0}
 )
 _FLOATS: Mapping[str, float] = MappingProxyType(

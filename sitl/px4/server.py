@@ -38,7 +38,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     """PX4's messages and commands; in simulation PX4 denies a reboot."""
 
     bad_interval, unknown_message = FAILED, DENIED
-    zero_interval_params = (2, 6)
 
     def __init__(self, ap: Px4, link_count: int, log: FlightLog) -> None:
         super().__init__(ap, [Px4Endpoint(ap) for _ in range(link_count)], log)
@@ -100,28 +99,20 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if self._ap.mode_name == "OFFBOARD":
             self._log.setpoints += 1
 
-    def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
-        if message.command == mav.MAV_CMD_DO_SET_MODE:
-            return self._change_mode(message, *params[:3])
-        return super()._execute(message, params, link)
-
-    def _change_mode(self, message: Message, base_mode: float, main: float, sub: float) -> int:
-        """Change to a custom mode; send the refusal as a text to ground stations only."""
-        if not all(map(math.isfinite, (base_mode, main, sub))):
+    def cmd_do_set_mode(self, params: Params7, _link: Px4Endpoint) -> int:
+        base_mode, main, sub = params[:3]
+        if not all(map(math.isfinite, params[:3])):
             return REJECTED
         mode = mode_of(int(main), int(sub))
         if not int(base_mode) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
             return REJECTED
-        is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
         if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
-        return ACCEPTED if self._ap.set_mode(mode, says_why=is_station) else REJECTED
+        return ACCEPTED if self._ap.set_mode(mode) else REJECTED
 
-    def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
-        if params[0] not in (0.0, 1.0):
-            return None
+    def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int:
         is_forced = params[1] == FORCE
-        done = self._ap.arm() if params[0] else self._ap.disarm(force=is_forced)
+        done = self._ap.arm() if params[0] == 1.0 else self._ap.disarm(force=is_forced)
         return ACCEPTED if done else REJECTED
 
     def cmd_nav_takeoff(self, params: Params7, _link: Px4Endpoint) -> int:

@@ -55,27 +55,6 @@ class VelocitySetpoint(NamedTuple):
     yaw_rate_radps: float
 
 
-class Held:
-    """Switch whose position, not 0, acts once after it was held."""
-
-    def __init__(self, hold_ns: int) -> None:
-        self._hold_ns = hold_ns
-        self._position = 0
-        self._since_ns: int | None = None
-
-    def see(self, position: int, now_ns: int) -> None:
-        """Note the present position; 0: none."""
-        if position != self._position:
-            self._position, self._since_ns = position, now_ns
-
-    def take(self, now_ns: int) -> int:
-        """Return the position, once, when it has been held long enough; else 0."""
-        if not self._position or self._since_ns is None or now_ns - self._since_ns < self._hold_ns:
-            return 0
-        self._since_ns = None
-        return self._position
-
-
 class Receiver:
     """RC receiver that hears the pilot's transmitter at 50 Hz."""
 
@@ -201,7 +180,7 @@ class Autopilot(ABC):
         conditions = config.conditions
         rate_noise_radps = math.hypot(conditions.rate_noise_radps, self.gyro_noise_radps)
         self._quad = Quadrotor(conditions, self.airframe)
-        self._wind = Wind(conditions, self.step_s)
+        self._wind = Wind(conditions, self.step_ns / NS_PER_S)
         self._noise = SensorNoise(replace(conditions, rate_noise_radps=rate_noise_radps))
         self.sensed = self.truth
         self._still_since_ns: int | None = boot_ns
@@ -223,10 +202,6 @@ class Autopilot(ABC):
 
         1500 is centred. Smaller is left, nose down and descent, as in ArduCopter.
         """
-
-    @property
-    def step_s(self) -> float:
-        return self.step_ns / NS_PER_S
 
     @property
     def truth(self) -> BodyState:

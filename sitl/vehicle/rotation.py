@@ -90,19 +90,15 @@ def to_euler(q: Quat) -> Vec3:
     return roll, pitch, yaw
 
 
-def rotation_vector(q: Quat) -> Vec3:
-    """Return axis times angle [rad] of the shorter way round."""
-    w, x, y, z = q
+def rotation_between(start: Quat, end: Quat) -> Vec3:
+    """Return the rotation vector from one attitude to another, in axes of the first: axis times
+    angle [rad] of the shorter way round."""
+    w, x, y, z = multiply(conjugate(start), end)
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, w) / sine
     return (x * scale, y * scale, z * scale)
-
-
-def rotation_between(start: Quat, end: Quat) -> Vec3:
-    """Return the rotation vector [rad] from one attitude to another, in axes of the first."""
-    return rotation_vector(multiply(conjugate(start), end))
 
 
 def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:

@@ -63,7 +63,6 @@ def test_the_version_comes_on_request(px4):
         (mav.MAVLINK_MSG_ID_ATTITUDE, 125, 120, 127),
         (mav.MAVLINK_MSG_ID_ATTITUDE, 200, 115, 130),
         (mav.MAVLINK_MSG_ID_HIGHRES_IMU, 250, 200, 251),
-        (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 250, 110, 126),
         (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 44, 56),  # by arrival: it has no stamp
     ],
 )

@@ -72,13 +72,8 @@ class Px4Companion(Companion):
             self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))
         return super().advance(seconds)
 
-    def set_mode(
-        self, mode: tuple[int, int], *, component_id: int = mav.MAV_COMP_ID_ONBOARD_COMPUTER
-    ) -> int:
-        self._mav.srcComponent = component_id
-        result = self.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
-        self._mav.srcComponent = mav.MAV_COMP_ID_ONBOARD_COMPUTER
-        return result
+    def set_mode(self, mode: tuple[int, int]) -> int:
+        return self.command(mav.MAV_CMD_DO_SET_MODE, 1, *mode)
 
     def sticks(self, sticks: tuple[int, int, int, int], *, system_id: int = GCS) -> None:
         """Send MANUAL_CONTROL: x, y, z, r."""

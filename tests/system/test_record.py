@@ -29,7 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = ("--camera", f"shm:record-{port}")
     sitl = [sys.executable, "-c", VEHICLE, "--connect", f"udpout:127.0.0.1:{port}", *camera]
     sitl += ["--image-size", "64", "--report", str(folder / "fc.json")]
-    sitl += ["--course", "5", "--pilot", "expert", "--pilot-speed", "10"]
+    sitl += ["--course", "5", "--pilot", "expert"]
     link = ("--connect", f"udp:127.0.0.1:{port}", *camera)
     with running(*sitl, log=folder / "sitl.log"):
         flags = ("--out", str(folder / "flights"), "--on-arm", "--episodes", "1")

@@ -146,7 +146,6 @@ def test_ctrl_c_does_not_stop_a_vehicle_that_a_shell_started_in_the_background()
         ["--connect", "udpout:127.0.0.1:9", "--fps", "3e9"],
         ["--connect", "udpout:127.0.0.1:9", "--duration", "1e300"],
         ["--connect", "udpout:127.0.0.1:9", "--fly-on", "1e308"],
-        ["--connect", "udpout:127.0.0.1:9", "--pilot-speed", "1e300"],
         ["--connect", "udpout:127.0.0.1:9", "--camera", "fpv"],
         ["--connect", "udpout:127.0.0.1:9", "--course", "x"],
         ["--connect", "udpout:127.0.0.1:9", "--rc-in", "70000"],

@@ -30,7 +30,7 @@ def vehicle_of(autopilot, **changes):
 
 
 def pilot_of(name, vehicle, axes=DEFAULT_AXES):
-    pilot, _ = make_pilot(name, axes, 5.0, vehicle=vehicle, course=COURSE, clock=Clock())
+    pilot, _ = make_pilot(name, axes, vehicle=vehicle, course=COURSE, clock=Clock())
     return pilot
 
 
