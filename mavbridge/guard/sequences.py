@@ -44,7 +44,8 @@ STICK_REST_NS = NS_PER_S
 a jump over the full range, PX4 sees less than 0.05 per second, the slowest motion that counts as a
 hand."""
 UNDONE_NS = NS_PER_S
-"""Time in a safe mode within which PX4 may leave it because of our jump to neutral."""
+"""Time in a safe mode within which PX4 may leave it because of our jump to neutral, and time since
+it did not get our sticks: then they jump to those of a receiver at rest, and back."""
 WORD_NS = 100 * NS_PER_MS
 """Wait for the EVENT that reports moved sticks; another station's mode change causes none."""
 MIDDLE_STICK = 0.2
@@ -217,6 +218,8 @@ class DisengageSequence:
     """Last request for the safe mode."""
     entered_ns: int = 0
     """Last request for the safe mode, or the first time after it that the mode was seen."""
+    missed_ns: int = -2 * UNDONE_NS
+    """Last time at which the vehicle perhaps did not get our sticks."""
     undone_ns: int | None = None
     """First time that the vehicle was seen in the mode that it enters when sticks move."""
     has_failed: bool = False
@@ -292,13 +295,19 @@ class DisengageSequence:
             return False
         undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
         is_undecided = now.now_ns - undone_ns <= WORD_NS
-        return undone_ns - self.entered_ns <= UNDONE_NS and (is_undecided or self._is_told(now))
+        is_new = undone_ns - max(self.entered_ns, self.missed_ns) <= UNDONE_NS
+        return is_new and (is_undecided or self._is_told(now))
 
     def _is_told(self, now: EngagementInputs) -> bool:
-        told_ns = now.status.stick_override_ns
+        """True if an EVENT tells of moved sticks, or ours were missing: then a hand is shown."""
+        told_ns, undone_ns = now.status.stick_override_ns, self.undone_ns
+        if undone_ns is not None and undone_ns - self.missed_ns <= UNDONE_NS:
+            return True
         return told_ns is not None and self.asked_ns is not None and told_ns >= self.asked_ns
 
     def _watch_undoing(self, now: EngagementInputs) -> None:
+        if now.link.problem is not None:
+            self.missed_ns = now.now_ns
         is_shown = now.link.echo_confirmed and now.link.overruled is None
         if self.mode is None or self.asked_ns is None or not is_shown:
             return

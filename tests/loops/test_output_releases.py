@@ -25,6 +25,7 @@ from sitl.px4.modes import Phase as LostPhase
 from sitl.px4.sticks import RC_SOURCE
 from sitl.vehicle.config import AutopilotName, Px4Release
 
+IDLE_US = (1500, 1500, 1000, 1500)
 FULL_YAW = Program(motion=lambda _: Motion(push=Push("yaw", 1.0)))
 GRACE_MS = 120
 """Three chunk periods or 100 ms, and 20 ms."""
@@ -278,6 +279,47 @@ def test_a_pilot_who_chooses_hold_in_that_failsafe_keeps_it() -> None:
     flight.pilot_changes_mode()
     flight.run(2.0)
     assert flight.px4.mode_name == "AUTO.LOITER", flight.describe()
+
+
+def over_an_idle_receiver(autopilot: AutopilotName) -> OutputFlight:
+    """A flight whose vehicle follows a receiver with its throttle down, should it miss us."""
+    flight = OutputFlight(autopilot, "sticks")
+    if flight.is_px4:
+        fall_back(flight, *IDLE_US)
+    flight.vehicle.set_receiver(IDLE_US)
+    return flight.fly(1.2)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "is_moved"), [("px4", False), ("px4", True), ("ardupilot", True)]
+)
+def test_unheard_sticks_are_followed_by_a_hold_and_only_by_a_pilot_whose_hand_is_seen(
+    autopilot: AutopilotName, is_moved: bool
+) -> None:
+    """A PX4 was released to the throttle and sank; a pilot of an ArduPilot was braked."""
+    flight = over_an_idle_receiver(autopilot)
+    silence(flight, up_s=4.0)
+    if is_moved:
+        later(flight, 3.5, lambda: flight.vehicle.set_receiver((1700, 1500, 1500, 1500)))
+    flight.run(5.0)
+    mode = flight.mode if is_moved else "AUTO.LOITER" if flight.is_px4 else "BRAKE"
+    assert flight.samples[-1].mode == mode, flight.describe()
+    is_held = flight.is_px4 and not is_moved
+    assert flight.phase is (Phase.HOLDING if is_held else Phase.RELEASED)
+    assert (Code.OVERRULED in flight.codes) is is_moved
+
+
+@pytest.mark.parametrize("down_s", [0.0, 0.9])
+def test_px4_is_held_again_after_it_has_left_our_sticks_for_an_idle_receiver(down_s: float) -> None:
+    """The jump to its throttle counts as a hand, which ends the mode that holds."""
+    flight = over_an_idle_receiver("px4")
+    flight.die()
+    flight.run(2.2)
+    silence(flight, up_s=0.9, down_s=down_s)
+    flight.until(lambda: flight.px4.mode_name == "POSCTL", within_s=0.8)
+    flight.run(1.5)
+    assert flight.px4.mode_name == "AUTO.LOITER", flight.describe()
+    assert flight.phase is Phase.HOLDING
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), MESSAGES)

@@ -11,8 +11,9 @@ Shown: TypeAlias = tuple[int, ...]
 """Numbers of a message in its own units, for example the PWM of the four sticks in RC_CHANNELS."""
 EchoFault: TypeAlias = Literal["unseen", "foreign", "returned", "silent"]
 """unseen: no echo since the first command, or no message that shows one. foreign: values that
-neither we nor the pilot's receiver sent. returned: the values shown before our first command.
-silent: our values, but constant although we keep changing them."""
+neither we nor a source at rest sent. returned: the values shown before our first command. silent:
+the vehicle hears us no more: our values, but constant although we keep changing them, or no echo;
+the values from before us may follow."""
 
 CONFIRM_NS = NS_PER_S
 """Longest wait for the first echo, and longest gap between echo messages. An override is echoed
@@ -65,6 +66,9 @@ class EchoRules:
     foreign values for a moment before the new mode is reported."""
     longest_pause_ns: int = NS_PER_S
     """Gap in the echo messages after which our commands count as lost."""
+    hand: int = 0
+    """Largest movement of another source at rest since our first command: more shows a hand. 0: the
+    message does not show sticks."""
 
 
 class EchoCheck:
@@ -160,8 +164,9 @@ class EchoCheck:
             self._forget_shown()
         if self.is_unshown(now_ns) and self._arrived_ns is not None:
             # Slow echoes must not put off the end of the wait for the first one of ours.
-            is_waiting = self.is_sending and not self.confirmed
-            if not is_waiting or now_ns - self._arrived_ns > CONFIRM_NS:
+            if self.confirmed:
+                self._forget_shown()
+            elif not self.is_sending or now_ns - self._arrived_ns > CONFIRM_NS:
                 self._restart(now_ns)
         self._arrived_ns = now_ns
         if self._since_ns is None:
@@ -184,13 +189,15 @@ class EchoCheck:
         is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))
         is_held &= not is_ours
         self._held_ours = values if is_ours or is_held else None
+        before, rules = self._baseline, self._rules
         if is_held:
             pass
-        elif not self.confirmed:
-            self._seek(values, is_ours, now_ns)
-        elif is_ours:
+        elif is_ours and (self.confirmed or before is None or not self._is_near(values, before)):
             self._matched_ns = now_ns
-        elif self._baseline is None or not self._is_near(values, self._baseline):
+            self._fault = None if self._fault == "unseen" else self._fault
+        elif not self.confirmed:
+            self._baseline = before if is_ours else values
+        elif before is None or not _is_within(max(rules.hand, rules.tolerance), values, before):
             if _is_often(self._foreign_us, shown_us):
                 self._fail("foreign", now_ns)
         elif _is_often(self._returned_us, shown_us):
@@ -218,20 +225,12 @@ class EchoCheck:
             self._baseline = values
 
     def _restart(self, now_ns: int) -> None:
-        """Restart echo tracking after a gap in echoes or commands, when any value is legitimate."""
+        """Restart echo tracking after a gap in commands, when any value is legitimate."""
         if self.is_sending:
             self._since_ns, self._matched_ns = now_ns, None
             self._forget_shown()
         if self._fault == "unseen":
             self._fault = None
-
-    def _seek(self, values: Shown, is_ours: bool, now_ns: int) -> None:
-        if not is_ours:
-            self._baseline = values
-        elif self._baseline is None or not self._is_near(values, self._baseline):
-            self._matched_ns = now_ns
-            if self._fault == "unseen":
-                self._fault = None
 
     def _watch_change(self, values: Shown, shown_us: int, now_ns: int) -> None:
         if values != self._held:
@@ -242,8 +241,9 @@ class EchoCheck:
             self._fail("silent", now_ns)
 
     def _fail(self, fault: EchoFault, now_ns: int) -> None:
-        """Note a fault; of several in a row the first is the likely cause."""
-        if self._fault is None or now_ns - self._fault_ns >= _RETRY_NS:
+        """Note a fault; of several in a row a hand counts, else the first, the likely cause."""
+        is_hand = fault == "foreign" and self._rules.hand > 0
+        if is_hand or self._fault is None or now_ns - self._fault_ns >= _RETRY_NS:
             self._fault = fault
         self._fault_ns = now_ns
 
@@ -255,7 +255,8 @@ class EchoCheck:
                 since_ns, longest_ns = self._matched_ns, self._rules.longest_pause_ns
             if now_ns - since_ns > longest_ns:
                 self._fail("unseen", now_ns)
-        return self._fault if now_ns - self._fault_ns < _RETRY_NS else None
+        fault = "silent" if self._fault == "unseen" and self.confirmed else self._fault
+        return fault if now_ns - self._fault_ns < _RETRY_NS else None
 
 
 def _is_often(times_us: deque[int], shown_us: int) -> bool:

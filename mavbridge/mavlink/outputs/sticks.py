@@ -86,8 +86,9 @@ class StickOutput(ActionOutput):
         return self._curves
 
 
-OVERRIDE_ECHO = EchoRules(tolerance=2, dithered=3, dither=1, seek_dither=4, centre=1500)
-"""Echo of PWM [us]. A receiver at rest moves by 2 us; the vehicle echoes overrides exactly.
+OVERRIDE_ECHO = EchoRules(tolerance=2, dithered=3, dither=1, seek_dither=4, centre=1500, hand=20)
+"""Echo of PWM [us]. A receiver at rest moves by 2 us, in minutes by more; the vehicle echoes
+overrides exactly.
 
 Roll is dithered: 1500, 1501 and 1502 us moved nothing, inside the dead zone of 20 us. Outside it, 2
 us are 0.2 degrees of lean at the usual calibration. Two of the larger steps also stay well inside
@@ -168,6 +169,7 @@ MANUAL_ECHO = EchoRules(
     seek_dither=4,
     centre=0,
     longest_pause_ns=450 * NS_PER_MS,
+    hand=20,
 )
 """Echo of x, y, z, r. PX4 shows received sticks, or one less (rounded down), at the rate of
 reception, and nothing if it receives nothing.

@@ -169,6 +169,7 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(
 
 
 SINCE, WORD = {"undone_ns": NS_PER_S}, 100 * NS_PER_MS
+MISSED = {"missed_ns": 1_500_000_000}
 
 
 @pytest.mark.parametrize(
@@ -187,6 +188,11 @@ SINCE, WORD = {"undone_ns": NS_PER_S}, 100 * NS_PER_MS
         (SINCE, {"now_ns": NS_PER_S + WORD + 1, "stick_override_ns": NS_PER_S}, True, NS_PER_S),
         (SINCE, {"now_ns": NS_PER_S + WORD + 1, "stick_override_ns": 1}, False, NS_PER_S),
         (SINCE, {"mode": "AUTO.LOITER"}, False, None),
+        # its sticks were not ours before: they jumped to a receiver's and back, and no EVENT came
+        (MISSED, {"now_ns": 2_500_000_000}, True, 2_500_000_000),
+        (MISSED, {"now_ns": 2_500_000_001}, False, 2_500_000_001),
+        (MISSED | {"undone_ns": 2 * NS_PER_S}, {"now_ns": 9 * NS_PER_S}, True, 2 * NS_PER_S),
+        (MISSED, {"now_ns": 2_500_000_000, "overruled": OVERRULED}, False, None),
     ],
 )
 def test_when_our_sticks_have_ended_the_safe_mode(

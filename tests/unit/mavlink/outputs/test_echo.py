@@ -123,6 +123,14 @@ class World:
             self.now_ns += MS // 2
         return None
 
+    def last_fault(self, duration_s: float) -> EchoFault | None:
+        """Go on after faults; return that of the end."""
+        end_ns, fault = self.now_ns + round(duration_s * S), None
+        while self.now_ns < end_ns:
+            fault = self.run((end_ns - self.now_ns) / S)
+            self.now_ns += MS // 2
+        return fault
+
     def engage(self) -> None:
         """Send until the echo is confirmed."""
         self.run(0.5)
@@ -240,6 +248,29 @@ def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> Non
     world.run(0.2)
     world.override = None
     assert world.seconds_to_fault()[0] == "returned"
+
+
+@pytest.mark.parametrize(
+    ("receiver", "fault"),
+    [
+        (RECEIVER, "silent"),
+        ((1015, 1490, 1500, 1520), "silent"),  # it drifts in minutes, and nobody touches it
+        ((1020, 1500, 1500, 1521), "foreign"),
+        ((1500, 1500, 1500, 1500), "foreign"),
+    ],
+)
+@pytest.mark.parametrize("downlink_loss", [0.0, 1.0])
+def test_after_sticks_that_expire_unheard_only_a_hand_on_the_receiver_counts(
+    receiver: Shown, fault: EchoFault, downlink_loss: float
+) -> None:
+    """Else the vehicle is given back to an idle receiver, or taken from a pilot who flies it."""
+    world = engaged()
+    world.is_deaf, world.loss = True, downlink_loss
+    assert world.last_fault(3.0) == "silent"
+    world.override, world.receiver, world.loss = None, receiver, 0.0
+    assert world.last_fault(4.0) == fault
+    world.is_deaf = False
+    assert world.last_fault(3.1) is None
 
 
 @pytest.mark.parametrize("keeps", [True, False], ids=["held", "expired"])
