@@ -327,7 +327,8 @@ class _Flight:
         is_told = False
         while not listener.ends_within(1 / STATUS_HZ):
             is_holding = view.phase is Phase.HOLDING
-            if is_holding:  # the guard's release and its summary come after the landing
+            # The guard's summary comes after the landing, or once its release is seen.
+            if is_holding or view.phase is Phase.RELEASING:
                 until_ns = self._clock.now_ns() + END_NS
             if is_holding and not is_told:
                 is_told = True

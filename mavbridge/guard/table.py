@@ -31,13 +31,11 @@ from mavbridge.guard.values import EndRequest, EngagementInputs, Phase
 WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
 RELEASE_TIMEOUT_NS = NS_PER_S
 """Longest wait for the vehicle to show sticks other than ours. Without a receiver it never does."""
-UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
-"""Longest wait if it does not even show our last sticks, since the releases may be lost too.
-Longer than the vehicle holds an override by itself (RC_OVERRIDE_TIME, 3 s by default)."""
 NOT_SET = (Code.SET_ABSENT, Code.SET_REFUSED, Code.SET_UNANSWERED)
 """Problems of a link that are over only after another start."""
 LOST_NS = 30 * NS_PER_S
-"""Silence of a held vehicle after which it counts as lost, and holding it ends."""
+"""Silence of a held vehicle after which it counts as lost, and holding it ends; and longest wait if
+it does not even show our last sticks, since it may not hear the releases either."""
 UNSEEN_NS = 2 * GAP_NS
 """Time without a reading after which the engage switch counts as dead: 20 periods of RC_CHANNELS at
 the lowest requested rate."""
@@ -204,13 +202,16 @@ def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
-    4 s if it does not even show our last sticks; the outcome then says that the release was not
+    30 s if it does not even show our last sticks; the outcome then says that the release was not
     seen. PX4's failsafe for lack of sticks is undone first, for 1.5 s.
     """
     if m.lost_mode(now) is not None:
         return False
-    timeout_ns = RELEASE_TIMEOUT_NS if now.link.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
-    return (now.link.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
+    if now.link.is_released and not m.owes_release:
+        return True
+    is_lost = now.now_ns - min(m.released_ns, m.heard_ns) >= LOST_NS
+    is_over = now.now_ns - m.released_ns >= RELEASE_TIMEOUT_NS
+    return is_over and (now.link.shows_last or is_lost)
 
 
 def ready(m: Memory, now: EngagementInputs) -> bool:

@@ -12,7 +12,7 @@ import pytest
 from helpers.output_flights import COMBINATIONS, HOVERING, OutputFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
-from mavbridge.core.vehicle import Action
+from mavbridge.core.vehicle import Action, OnFault
 from mavbridge.guard.values import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.link import MavlinkLink
@@ -348,17 +348,26 @@ def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_ne
         assert found.final_mode == hold(flight)
 
 
-@pytest.mark.parametrize(("kind", "up_s", "down_s"), [("sticks", 2.5, 1.2), ("rates", 4.0, 0.0)])
+@pytest.mark.parametrize(
+    ("kind", "on_fault", "up_s", "down_s"),
+    [
+        ("sticks", "hold", 2.5, 1.2),
+        ("rates", "hold", 4.0, 0.0),
+        ("sticks", "release", 4.6, 0.0),
+        ("sticks", "release", 4.6, 4.6),
+    ],
+)
 def test_a_vehicle_that_holds_our_last_command_without_hearing_us_is_never_left_to_it(
-    kind: ActionKind, up_s: float, down_s: float
+    kind: ActionKind, on_fault: OnFault, up_s: float, down_s: float
 ) -> None:
-    """It leaned on for 3 s, until RC_OVERRIDE_TIME, or drifted for ever in GUIDED_NOGPS."""
-    flight = OutputFlight("ardupilot", kind, on_fault="hold").fly(1.2)
+    """It leaned on until RC_OVERRIDE_TIME, or drifted for ever in GUIDED_NOGPS."""
+    params = {"RC_OVERRIDE_TIME": 8.0} if on_fault == "release" else {}
+    flight = OutputFlight("ardupilot", kind, params=params, on_fault=on_fault).fly(1.2)
     at_s = flight.t_s
     silence(flight, up_s=up_s, down_s=down_s)
     flight.run(up_s + 1.2)
     found = flight.aftermath(at_s)
-    assert found.final_mode == "BRAKE", flight.describe()
+    assert found.final_mode == ("BRAKE" if on_fault == "hold" else "ALT_HOLD"), flight.describe()
     assert found.lean_held_ms < 1000 * up_s + 160, found
 
 

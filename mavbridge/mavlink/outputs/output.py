@@ -71,6 +71,10 @@ class ActionOutput(ABC):
         """Return sticks to send before the first release, or None."""
         return None
 
+    def must_release(self, sent: int, now_ns: int) -> bool:
+        """True if another packet has to follow the ``sent`` ones of a release."""
+        return sent < self.releases
+
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """Encode one of the ``releases``; return None if there is nothing to release."""
         return None

@@ -68,9 +68,10 @@ class ActionSender:
         self._flight: tuple[ActionMeaning, Output | None] | None = None
         """Meaning of the policy's actions, and the requested output; None: no policy is loaded."""
         self._vehicle: VehicleSession | None = None
-        self._releases_left = self._release_due_ns = 0
-        """Number of packets of a release that may still follow the last action, and time of the
-        next one."""
+        self._releases: int | None = None
+        """Number of packets of the release since the last action; None: nothing was sent."""
+        self._release_due_ns = 0
+        """Time of the next one."""
         self.is_release_owed = False
         """True if a release could not be sent: call ``try_release`` before everything else."""
         self.output: ActionOutput | None = None
@@ -113,7 +114,7 @@ class ActionSender:
         if encoded is None or (self.is_release_owed and not self.try_release()):
             return None
         # Before the send: a failed send may still go out.
-        self._releases_left, self._release_due_ns = output.releases, 0
+        self._releases, self._release_due_ns = 0, 0
         if not self._connection.send(encoded.packet):
             # A lost connection is reported as such.
             if not self._connection.is_down and encoded.shown is not None:
@@ -156,10 +157,10 @@ class ActionSender:
         vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
         if vehicle is None or output is None:
             return True
-        if self._releases_left == 0 or now_ns < self._release_due_ns:
+        sent, is_due = self._releases, now_ns >= self._release_due_ns
+        if sent is None or not is_due or not output.must_release(sent, now_ns):
             output.released()
             return True
-        sent = output.releases - self._releases_left
         level = output.last_sticks(vehicle, now_ns) if sent < LEVELS else None
         packet = output.release_packet(vehicle, now_ns) if level is None else level.packet
         is_sent = packet is None or self._connection.send(packet)
@@ -169,7 +170,7 @@ class ActionSender:
             output.released()
         self.is_release_owed = not is_sent
         if is_sent:
-            self._releases_left -= 1
+            self._releases = sent + 1
             self._release_due_ns = self._clock.now_ns() + RELEASE_SPACING_NS
         return is_sent
 

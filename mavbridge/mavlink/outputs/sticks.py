@@ -105,8 +105,7 @@ class OverrideOutput(StickOutput):
 
     name: Output = "rc-override"
     releases = 80
-    """Sent over the four seconds of a release at most; the silence that follows lets another
-    station override."""
+    """Four seconds; the silence that follows lets another station override."""
     _echo_message = "RC_CHANNELS"
 
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
@@ -134,6 +133,10 @@ class OverrideOutput(StickOutput):
             self.echo.received(pwm_us, body.boot_us, arrived_ns)
         vehicle.condition.is_receiver_hidden = self.echo.has_sent
         vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
+
+    def must_release(self, sent: int, now_ns: int) -> bool:
+        """True for a while, and as long as the vehicle still holds sticks of ours."""
+        return super().must_release(sent, now_ns) or self.echo.is_held(now_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.

@@ -506,10 +506,14 @@ CASES = {
     "the pilot's BRAKE soon after ours": Case(lambda: after(lambda: after(refused, 0.01,
         mode="BRAKE"), 0.01, mode="LOITER"), {"mode": "BRAKE"}, RELEASING, RELEASE),
     "release not seen yet": Case(lambda: after(releasing, 0.98), {}, RELEASING, RELEASE),
-    "release perhaps not heard": Case(lambda: after(releasing, 3.99, shows_last=False), {},
+    "release perhaps not heard": Case(lambda: after(releasing, 29.99, shows_last=False), {},
         RELEASED, refusal=Code.RELEASE_NOT_SEEN),
-    "release perhaps not heard yet": Case(lambda: after(releasing, 3.98, shows_last=False), {},
+    "release perhaps not heard yet": Case(lambda: after(releasing, 29.98, shows_last=False), {},
         RELEASING, RELEASE),
+    "release of a lost vehicle": Case(lambda: after(leaving, 31.21, heard_ns=0, shows_last=False),
+        {}, RELEASED, refusal=Code.RELEASE_NOT_SEEN),
+    "release of a lost vehicle goes on": Case(lambda: after(leaving, 31.2, heard_ns=0,
+        shows_last=False), {}, RELEASING, RELEASE),
     "ended": Case(lambda: after(waiting, 0.01, stop=SIGNAL), {**ACT, "mode": "LOITER"}, ENDED),
 }
 # fmt: on
