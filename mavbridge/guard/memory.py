@@ -186,7 +186,9 @@ class Memory:
         """
         self._note_end(cause)
         reason = cause.reason
-        if self.phase in (Phase.LEAVING, Phase.HOLDING) and self.reason is not None:
+        # On the ground a vehicle disarms itself for want of what the way in waits for.
+        is_first = self.phase is not Phase.PREPARING or reason.code is Code.DISARMED
+        if is_first and self.reason is not None:
             reason = because(Code.THEN, first=self.reason, then=reason)
         self.reason = reason
         self._note_release(now)

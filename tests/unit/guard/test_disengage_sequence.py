@@ -191,7 +191,7 @@ MISSED = {"missed_ns": 1_500_000_000}
         # its sticks were not ours before: they jumped to a receiver's and back, and no EVENT came
         (MISSED, {"now_ns": 2_500_000_000}, True, 2_500_000_000),
         (MISSED, {"now_ns": 2_500_000_001}, False, 2_500_000_001),
-        (MISSED | {"undone_ns": 2 * NS_PER_S}, {"now_ns": 9 * NS_PER_S}, True, 2 * NS_PER_S),
+        (MISSED | {"undone_ns": 2_500_000_000}, {"now_ns": 9 * NS_PER_S}, True, 2_500_000_000),
         (MISSED, {"now_ns": 2_500_000_000, "overruled": OVERRULED}, False, None),
     ],
 )
