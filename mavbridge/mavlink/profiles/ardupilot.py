@@ -88,7 +88,7 @@ _MODES = ModeTable(
         land="LAND",
         rtl="RTL",
         takeoff=("GUIDED",),
-        thrust=("STABILIZE", "ACRO"),
+        thrust=("STABILIZE", "ACRO", "DRIFT"),
         setpoint=("GUIDED", "GUIDED_NOGPS"),
     ),
 )

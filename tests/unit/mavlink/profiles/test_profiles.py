@@ -16,6 +16,7 @@ from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import NoteKind, ParamContext, ParamNote, Profile
 from mavbridge.mavlink.profiles.px4 import PX4, event_id
 from mavbridge.mavlink.session.vehicle import require_profile
+from policy.contract import STICK_MODES
 
 RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 6.0}
 BOTH = pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
@@ -31,6 +32,12 @@ def notes_of(
 ) -> list[ParamNote]:
     notes = profile.notes(values, ParamContext(output, 255, has_receiver))
     return [note for note in notes if note.kind == kind]
+
+
+def test_sticks_are_released_only_in_modes_that_hold_the_height() -> None:
+    """DRIFT damps the climb alone (get_throttle_assist)."""
+    thrust = {*ARDUPILOT.modes.roles.thrust, *PX4.modes.roles.thrust}
+    assert {*STICK_MODES} - thrust == {"ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "ALTCTL", "POSCTL"}
 
 
 @pytest.mark.parametrize("vehicle_type", [2, 3, 4 + 9, 14, 15, 29, 35])
