@@ -24,6 +24,9 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 
 _CURVES_NS = 500 * NS_PER_MS
 """Longest delay until a parameter change reaches the stick curves; a mode change does at once."""
+_LOW_THROTTLE, _MOST_LOW_YAW = -0.5, 0.8
+"""Largest yaw up to a throttle, in modes whose throttle is thrust. ArduPilot disarms there, in the
+air too, after 2 s of yaw beyond 0.89 and throttle within RC3_DZ, 200 us at most (ARMING_RUDDER)."""
 
 
 class StickOutput(ActionOutput):
@@ -74,8 +77,12 @@ class StickOutput(ActionOutput):
         if action is IDLE:
             return action, IDENTITY
         status = vehicle.status(now_ns)
-        curves = self._curves_of(vehicle, status.mode if status else "", now_ns)
-        return curves.to_vehicle(action), curves
+        mode = status.mode if status else ""
+        curves = self._curves_of(vehicle, mode, now_ns)
+        sticks = curves.to_vehicle(action)
+        if mode in vehicle.profile.modes.roles.thrust and sticks.throttle <= _LOW_THROTTLE:
+            sticks = sticks._replace(yaw=min(max(sticks.yaw, -_MOST_LOW_YAW), _MOST_LOW_YAW))
+        return sticks, curves
 
     def _curves_of(self, vehicle: VehicleSession, mode: str, now_ns: int) -> StickCurves:
         if mode != self._curves_mode or now_ns >= self._curves_due_ns:

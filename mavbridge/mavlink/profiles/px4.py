@@ -183,7 +183,7 @@ class Px4(Profile):
     params = (
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
-        *("MAN_ARM_GESTURE", "MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
+        *("MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
         *("COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
         *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
@@ -351,10 +351,6 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
         effect = ": in STABILIZED the middle of the throttle is half thrust, not hover thrust"
         yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
     yield ParamNote("wanted", ("COM_DISARM_PRFLT",), "longer than it takes to lift off")
-    yield ParamNote("wanted", ("MAN_ARM_GESTURE",), "0")
-    if values.get("MAN_ARM_GESTURE") == 1:
-        effect = ": throttle down and full yaw for a second arms; a policy on the ground might"
-        yield ParamNote.of("hint", "MAN_ARM_GESTURE", 1, effect, 0)
 
 
 def _end_notes(

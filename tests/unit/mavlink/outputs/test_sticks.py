@@ -218,6 +218,21 @@ def test_sticks_are_released_once_others_are_shown_or_none() -> None:
 # --- overrides
 
 
+@pytest.mark.parametrize(
+    ("mode", "throttle", "yaw"),
+    [("STABILIZE", -1.0, 0.8), ("ACRO", -0.5, 0.8), ("ACRO", -0.49, 1.0), ("ALT_HOLD", -1.0, 1.0)],
+)
+@pytest.mark.parametrize("side", [1, -1])
+def test_no_throttle_and_yaw_of_a_policy_disarm_a_copter_in_the_air(
+    mode: str, throttle: float, yaw: float, side: int
+) -> None:
+    flight = copter_flight()
+    flight.vehicle.mode = mode
+    sent = flight.send(Sticks(throttle, float(side), 0.0, 0.0)).action
+    assert isinstance(sent, Sticks)
+    assert (sent.throttle, sent.yaw) == pytest.approx((throttle, side * yaw), abs=0.005)
+
+
 def test_other_actions_than_sticks_are_refused() -> None:
     for flight in (px4_flight(), copter_flight()):
         with pytest.raises(CommandRefusedError, match="not sticks"):
