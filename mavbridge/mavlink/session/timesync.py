@@ -85,7 +85,7 @@ class TimesyncFilter:
         """Arrival and vehicle time of the newest answers."""
         self.round_trips = Histogram()
         self._trusted_ns: int | None = None
-        """Last request with a good offset, or else the first one; None before it."""
+        """Last answer with a good offset, or else the first request; None before it."""
         self._has_told = False
 
     def request(self, now_ns: int, early_ns: int = 0) -> int | None:
@@ -94,15 +94,14 @@ class TimesyncFilter:
             return None
         self._next_ns = now_ns + period_ns(TIMESYNC_HZ)
         self._outstanding.append(now_ns)
-        if self.is_good or self._trusted_ns is None:
+        if self._trusted_ns is None:
             self._trusted_ns = now_ns
         elif not self._has_told and now_ns - self._trusted_ns > _TRUST_NS:
             self._has_told = True
             fault = "is not answered in time (a router drops it, or the link is slow)"
             if self._clocks:
                 fault = "answers are too few, or disagree"
-            effect = "ages count from arrival, so a delay of the link is not seen"
-            self._report(AdviceText(f"TIMESYNC {fault}: {effect}"))
+            self._report(AdviceText(f"TIMESYNC {fault}: a delay of the link may not be seen"))
         return now_ns
 
     def receive(self, reply: Timesync, arrived_ns: int) -> None:
@@ -132,6 +131,7 @@ class TimesyncFilter:
             best = new
         self._best = best
         self._agreeing += 1
+        self._trusted_ns = arrived_ns if self.is_good else self._trusted_ns
         sending_ns = reply.tc1 - best.offset_ns - reply.ts1
         self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
         if not self._has_told and (slow := self.slow_clock) is not None:
