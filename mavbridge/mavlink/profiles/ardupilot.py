@@ -24,14 +24,16 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
 )
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
+    SHORTEST_S,
     ModeTable,
     ParamContext,
     ParamNote,
     Profile,
     StreamGroup,
     Traits,
+    clipped_note,
     condition_streams,
-    long_timeout,
+    timeout_notes,
 )
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
@@ -63,7 +65,7 @@ _FIRST_NAMES = (
     "FLTMODE_CH",
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER", "Q_ENABLE"),
-    *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
+    *("PILOT_Y_RATE", "PILOT_Y_EXPO", "ATC_RATE_Y_MAX"),
     *("MAV_GCS_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "PILOT_SPD_DN", "PILOT_TKO_ALT_M"),
     # the same up to 4.6
     *("SYSID_MYGCS", "ANGLE_MAX", "PILOT_SPEED_UP", "PILOT_SPEED_DN", "PILOT_TKOFF_ALT"),
@@ -197,6 +199,7 @@ def _override_notes(
     yield from map_notes(values, context.booted)
     yield from stick_notes(values)
     yield from takeoff_notes(values)
+    yield from clipped_note(values, "ATC_RATE_Y_MAX", "PILOT_Y_RATE")
     yield from _timeout_notes(values, context)
     for names, unknown in (
         (_RISK_NAMES, "it holds its last sticks for ever if this computer dies"),
@@ -225,15 +228,16 @@ def _override_notes(
 def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what ends overrides too early, too late or never."""
     name, time_s = "RC_OVERRIDE_TIME", values.get("RC_OVERRIDE_TIME", 1.0)
-    yield ParamNote("wanted", (name,), f"0.5; above 0, at most {LONGEST_S:g} s")
+    yield ParamNote("wanted", (name,), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
     if time_s == 0:
         yield ParamNote.of("obstacle", name, time_s, ", which disables overrides", 0.5)
     if time_s < 0:
         why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
         yield ParamNote.of_risk("endless-override", why, name, f"--set {name}=0.5")
-    yield from long_timeout(values, name, "hold its last sticks")
+    if time_s > 0:
+        yield from timeout_notes(values, name, "hold its last sticks")
     if context.has_receiver is False:  # overrides that have ended are then kept until the failsafe
-        yield from long_timeout(values, "RC_FS_TIMEOUT", "hold its last sticks")
+        yield from timeout_notes(values, "RC_FS_TIMEOUT", "hold its last sticks")
     failsafe = "not 0" if context.has_receiver else "not 0, without a receiver"
     yield ParamNote("wanted", ("FS_THR_ENABLE",), failsafe)
     if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
@@ -262,8 +266,8 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
         effect = ", with which it takes our thrust for a climb rate"
         mended = int(options) | _THRUST_AS_THRUST
         yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
-    yield ParamNote("wanted", ("GUID_TIMEOUT",), f"0.5; at most {LONGEST_S:g} s")
-    yield from long_timeout(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
+    yield ParamNote("wanted", ("GUID_TIMEOUT",), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
+    yield from timeout_notes(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
     yield ParamNote("wanted", ("FS_THR_ENABLE",), "not 0" if context.has_receiver else "0")
     failsafe = values.get("FS_THR_ENABLE", 0.0)
     if context.has_receiver is False and failsafe != 0:

@@ -154,21 +154,36 @@ class ParamNote(NamedTuple):
 
 LONGEST_S = 1.0
 """Longest useful timeout; a longer one leaves the vehicle uncontrolled longer than necessary."""
+SHORTEST_S = 0.3
+"""Shortest safe timeout: a guard on a busy computer may be late by a tenth of it, and a link may
+lose a few packets in a row."""
 _LONGEST_SETPOINT_S = 3.0
 """Longest time to follow the last setpoint of a dead guard; ArduPilot's default."""
 
 
-def long_timeout(
+def timeout_notes(
     values: Mapping[str, float], name: str, does: str, *, is_setpoint: bool = False
 ) -> Iterator[ParamNote]:
-    """Yield a note if the vehicle would go on for too long after the death of the guard."""
-    time_s = values.get(name, 0.0)
+    """Yield a note if the vehicle would go on for too long after the death of the guard, or would
+    not wait for packets that are late."""
+    time_s = values.get(name, LONGEST_S)
     if is_setpoint and time_s > _LONGEST_SETPOINT_S:
         why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
         yield ParamNote.of_risk("long-setpoint", why, name, f"--set {name}=0.5")
     if time_s > LONGEST_S:
         effect = f": if this computer died, the vehicle would {does} for that many seconds"
         yield ParamNote.of("advice", name, time_s, effect, 0.5)
+    if 0.0 <= time_s < SHORTEST_S:
+        effect = ": a pause of our packets as short as that counts as their end"
+        yield ParamNote.of("advice", name, time_s, effect, 0.5)
+
+
+def clipped_note(values: Mapping[str, float], limit: str, full: str) -> Iterator[ParamNote]:
+    """Yield a note if a limit of the vehicle is below its motion at full stick."""
+    most, wanted = values.get(limit, 0.0), values.get(full, 0.0)
+    if 0.0 < most < wanted:
+        effect = f": it clips the motion of a stick, which is {wanted:g} at its end ({full})"
+        yield ParamNote.of("advice", limit, most, effect, wanted)
 
 
 class ParamContext(NamedTuple):

@@ -15,6 +15,7 @@ from mavbridge.core.vehicle import ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.profile import (
     LONGEST_S,
+    SHORTEST_S,
     EventMeaning,
     ModeTable,
     ParamContext,
@@ -22,8 +23,9 @@ from mavbridge.mavlink.profiles.profile import (
     Profile,
     StreamGroup,
     Traits,
+    clipped_note,
     condition_streams,
-    long_timeout,
+    timeout_notes,
 )
 from mavbridge.mavlink.profiles.sticks import (
     IDENTITY,
@@ -64,9 +66,6 @@ _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
 """Values of COM_OBL_RC_ACT."""
 _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
 """Bits of COM_RCL_EXCEPT: modes in which the loss of sticks is no failsafe."""
-_SHORTEST_S = 0.3
-"""Shortest safe timeout: a guard on a busy computer may be late by a tenth of it, and a link may
-lose a few packets in a row."""
 _SLOWEST_HAND_PER_S = 0.05
 """Default if neither parameter was read: the minimum of COM_RC_STICK_OV, 5 %."""
 
@@ -188,7 +187,7 @@ class Px4(Profile):
         *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
-        *("MAN_KILL_GEST_T", "MPC_TILTMAX_AIR", "MPC_THR_CURVE"),
+        *("MAN_KILL_GEST_T", "MPC_TILTMAX_AIR", "MC_YAWRATE_MAX", "MPC_THR_CURVE"),
     )
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
@@ -342,11 +341,8 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
             "--engage-channel; they count 0.6 s later, once moved"
         )
         yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect)
-    full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
-    if limit_deg is not None and limit_deg < full_deg:
-        full = f"{full_deg:g} deg (MPC_MAN_TILT_MAX)"
-        effect = f": in ALTCTL it leans no further, and full stick is {full}"
-        yield ParamNote.of("advice", "MPC_TILTMAX_AIR", limit_deg, effect, full_deg)
+    yield from clipped_note(values, "MPC_TILTMAX_AIR", "MPC_MAN_TILT_MAX")
+    yield from clipped_note(values, "MC_YAWRATE_MAX", "MPC_MAN_Y_MAX")
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
         effect = ": in STABILIZED the middle of the throttle is half thrust, not hover thrust"
         yield ParamNote.of("advice", "MPC_THR_CURVE", _NO_RESCALE, effect, 0)
@@ -358,13 +354,10 @@ def _end_notes(
 ) -> Iterator[ParamNote]:
     """Yield unexpected effects of the end of our packets, by two parameters."""
     does, is_setpoint = "go on with the last it was told", time == "COM_OF_LOSS_T"
-    yield ParamNote("wanted", (time,), f"0.5; {_SHORTEST_S:g} to {LONGEST_S:g} s")
+    yield ParamNote("wanted", (time,), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
     end = "4 or 5 (land, hold)" if is_setpoint else "1, 2 or 3 (hold, return, land)"
     yield ParamNote("wanted", (action,), end)
-    yield from long_timeout(values, time, does, is_setpoint=is_setpoint)
-    if (time_s := values.get(time, LONGEST_S)) < _SHORTEST_S:
-        effect = ": a pause of our packets as short as that is a failsafe"
-        yield ParamNote.of("advice", time, time_s, effect)
+    yield from timeout_notes(values, time, does, is_setpoint=is_setpoint)
     if (value := values.get(action, 0.0)) in fatal:
         effect = f": it would {fatal[int(value)]} if our packets stopped"
         yield ParamNote.of("advice", action, value, effect)

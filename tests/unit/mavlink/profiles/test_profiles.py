@@ -140,12 +140,25 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
         (ARDUPILOT, {"PILOT_TKO_ALT_M": 9.0}, "velocity", True, []),
         (PX4, {"COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}, "manual-control", None, []),
         (PX4, {"COM_RC_LOSS_T": 2.0}, "manual-control", None, ["--set COM_RC_LOSS_T=0.5"]),
-        (PX4, {"COM_RC_LOSS_T": 0.1}, "manual-control", None, ["as short as that is a failsafe"]),
+        *(
+            (profile, values | {name: 0.1}, output, False, [f"--set {name}=0.5"])
+            for profile, values, name, output in (
+                (PX4, {}, "COM_RC_LOSS_T", "manual-control"),
+                (PX4, {}, "COM_OF_LOSS_T", "velocity"),
+                (ARDUPILOT, SAFE, "RC_OVERRIDE_TIME", "rc-override"),
+                (ARDUPILOT, SAFE, "RC_FS_TIMEOUT", "rc-override"),
+                (ARDUPILOT, {}, "GUID_TIMEOUT", "rates"),
+            )
+        ),
         (PX4, {"NAV_RCL_ACT": 6.0}, "manual-control", None, ["NAV_RCL_ACT is 6: it would disarm"]),
-        (
-            *(PX4, {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 20.0}),
-            *("manual-control", None),
-            ["--set MPC_TILTMAX_AIR=35"],
+        *(
+            (profile, values | {full: 35.0, limit: most}, output, True, told)
+            for profile, values, output, full, limit in (
+                (PX4, {}, "manual-control", "MPC_MAN_TILT_MAX", "MPC_TILTMAX_AIR"),
+                (PX4, {}, "manual-control", "MPC_MAN_Y_MAX", "MC_YAWRATE_MAX"),
+                (ARDUPILOT, SAFE, "rc-override", "PILOT_Y_RATE", "ATC_RATE_Y_MAX"),
+            )
+            for most, told in ((20.0, [f"--set {limit}=35"]), (35.0, []), (0.0, []))
         ),
         (PX4, {"MPC_THR_CURVE": 1.0}, "manual-control", None, ["--set MPC_THR_CURVE=0"]),
         (PX4, {"COM_RC_IN_MODE": 6.0}, "manual-control", True, ["take over by --engage-channel"]),
