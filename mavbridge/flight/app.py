@@ -246,9 +246,9 @@ class _Flight:
     @property
     def outcome(self) -> FlightOutcome | None:
         """Outcome of the policy's flight; None if the policy never flew."""
-        is_current = self._guard.summary is not None
-        referee, status = self._observers.referee, self._view.status
-        return referee.outcome(self._ending, status, is_current=is_current)
+        summary, referee = self._guard.summary, self._observers.referee
+        told = None if summary is None else summary.outcome
+        return referee.outcome(self._ending, self._view.status, told)
 
     def run(self, stop: StopRequest) -> None:
         """Fly until the guard ends, a loop ends, or a signal arrives."""

@@ -13,7 +13,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.values import EndRequest, Phase
+from mavbridge.guard.values import EndRequest, Outcome, Phase
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 from mavbridge.recording.crash import CrashWatch
 
@@ -118,16 +118,19 @@ class FlightReferee:
         return EndRequest(because(Code.COURSE_DONE), "course") if is_over else None
 
     def outcome(
-        self, asked: EndRequest, vehicle: GuardStatus, *, is_current: bool = True
+        self, asked: EndRequest, vehicle: GuardStatus, told: Outcome | None
     ) -> FlightOutcome | None:
         """Return the outcome of the flight; None if the policy has not flown.
 
-        ``asked``: the end, if the guard died before it could tell one; ``is_current``: the guard
-        has reported ``vehicle`` until its own end.
+        ``asked``: the end, if the guard died before it could tell one; ``told``: from its summary,
+        up to which it has reported ``vehicle``.
         """
         if (flown := self._flown) is None:
             return None
-        reason, end = self._ended or asked
+        known: tuple[Reason | None, FlightEnd] = self._ended or asked
+        if self._ended is None and told is not None and told.end is not None:
+            known = (told.fault if told.end == "fault" else None), told.end
+        reason, end = known
         position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
@@ -139,7 +142,7 @@ class FlightReferee:
             mode=vehicle.mode,
             is_armed=vehicle.armed,
             is_landed=vehicle.is_landed,
-            is_current=is_current,
+            is_current=told is not None,
             gates_total=self._gates_total,
             gates_passed=len(passed_ns) if knows_gates else None,
             course_s=(passed_ns[-1] - self._began_ns) / NS_PER_S if passed_ns else None,

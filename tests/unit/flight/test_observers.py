@@ -48,7 +48,7 @@ def test_a_flight_that_flew_is_reported_although_the_vehicle_is_gone(tmp_path: P
     watching = observers(report := tmp_path / "report.json", io.StringIO())
     watching.referee.emit(make_tick(0, phase="flying"))
     gone = GuardStatus("ArduPilot", None, False, None, (), None)
-    watching.finish(None, None, watching.referee.outcome(DEATH, gone))
+    watching.finish(None, None, watching.referee.outcome(DEATH, gone, None))
     assert report.exists()
 
 

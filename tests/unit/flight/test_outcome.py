@@ -11,7 +11,7 @@ import pytest
 from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.fakes import FakeClock
 from mavbridge.core.course import CourseGate
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd, LinkStats
@@ -132,7 +132,7 @@ def judged(
     referee = FlightReferee(gates)
     for tick in ticks:
         referee.emit(tick)
-    outcome = referee.outcome(EndRequest(FAULT, end), HOVERING)
+    outcome = referee.outcome(EndRequest(FAULT, end), HOVERING, Outcome(end=end, fault=FAULT))
     assert outcome is not None
     return outcome
 
@@ -143,7 +143,7 @@ def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     assert over[0] == 80 + RUN_OUT_NS // 10_000_000
     ending = referee.ending(ticks[-1].sent_ns)
     assert ending == EndRequest(because(Code.COURSE_DONE), "course")
-    outcome = referee.outcome(ending, HOVERING)
+    outcome = referee.outcome(ending, HOVERING, Outcome(end="course"))
     assert outcome is not None
     assert (outcome.gates_passed, outcome.gates_total, outcome.success) == (2, 2, True)
     assert outcome.course_s == pytest.approx(0.8)
@@ -193,7 +193,7 @@ def test_without_guards_a_flight_is_told_by_its_end() -> None:
     told = "ended by --duration after 2.0 s, at 2.0 m, 10.0 m/s, now armed in LOITER"
     assert describe(outcome) == told
     assert FlightReferee(None).ending(10**18) is None
-    assert FlightReferee(GATES).outcome(DEATH, HOVERING) is None, "nobody has flown"
+    assert FlightReferee(GATES).outcome(DEATH, HOVERING, None) is None, "nobody has flown"
 
 
 def test_each_flight_ends_as_the_guard_tells_and_by_its_death_before() -> None:
@@ -204,11 +204,23 @@ def test_each_flight_ends_as_the_guard_tells_and_by_its_death_before() -> None:
     for ticks, (reason, end) in ((first, taken), (course_ticks(50), DEATH)):
         for tick in ticks:
             referee.emit(tick)
-        outcome = referee.outcome(DEATH, HOVERING, is_current=False)
+        outcome = referee.outcome(DEATH, HOVERING, None)
         assert outcome is not None
         assert (outcome.reason, outcome.end) == (reason, end)
     assert describe(outcome).endswith("last seen armed in LOITER: the guard has died")
     assert "last seen armed in an unknown mode: " in describe(replace(outcome, mode=None))
+
+
+@pytest.mark.parametrize(("end", "reason"), [("fault", FAULT), ("takeover", None)])
+def test_an_end_of_which_no_tick_came_through_is_told_by_the_summary(
+    end: FlightEnd, reason: Reason | None
+) -> None:
+    referee, asked = FlightReferee(None), EndRequest(because(Code.SIGNAL))
+    for tick in course_ticks(50):
+        referee.emit(tick)
+    outcome = referee.outcome(asked, HOVERING, Outcome(flights=1, end=end, fault=FAULT))
+    assert outcome is not None
+    assert (outcome.end, outcome.reason) == (end, reason)
 
 
 def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:
