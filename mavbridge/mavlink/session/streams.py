@@ -95,7 +95,7 @@ class _Stream:
     def is_slow(self, span_s: float) -> bool:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
-        return not self.is_given_up and self.arriving_hz(span_s) <= least_hz
+        return self.arriving_hz(span_s) <= least_hz
 
 
 def _options(group: StreamGroup) -> list[tuple[Request, float]]:
@@ -261,7 +261,9 @@ class StreamRequester:
                 stream.is_absence_told = True
                 comes = f"comes at {rate_hz:.1g} Hz" if stream.received else "does not come"
                 self._report(f"{group.messages[0]} {comes}: {group.without}")
-            if stream.is_slow(span_s):
+            if not stream.is_slow(span_s):
+                stream.is_given_up = False  # the denial was a late one of another request
+            elif not stream.is_given_up:
                 stream.is_settled = False
                 self.renewals += stream.group.is_needed
 
