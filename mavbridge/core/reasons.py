@@ -143,8 +143,14 @@ class Code(StrEnum):
     UNHEARD = _vehicle("the vehicle does not hear our {quantity}")
     NO_ECHO = _vehicle("no {message} arrives, so our {quantity} cannot be checked")
     LATE_SENDING = _vehicle("our packets take {age_ms:.0f} ms or more to reach the vehicle")
-    READING_PARAMETERS = _waiting("reading the vehicle's parameters")
-    REQUESTING_TELEMETRY = _waiting("requesting telemetry from the vehicle")
+    READING_PARAMETERS = _waiting(
+        "reading the vehicle's parameters: if this lasts, it does not hear us; check the way to it "
+        "(port, baud rate, signing)"
+    )
+    REQUESTING_TELEMETRY = _waiting(
+        "requesting telemetry from the vehicle: if this lasts, its answers (COMMAND_ACK) do not "
+        "arrive; check what forwards the link"
+    )
     LOOKING_FOR_RECEIVER = _waiting("looking for the pilot's radio receiver")
     SETTING_PARAMETERS = _waiting("setting the vehicle's parameters")
     SET_NEEDS_DISARMING = _waiting("--set waits until the vehicle is disarmed")
