@@ -13,7 +13,6 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     OPTION_CHANNELS,
     SIMPLE_NAMES,
     STICKS,
-    TURNED,
     ardupilot_curves,
     calibration,
     is_simple_setting,
@@ -201,13 +200,6 @@ def _override_notes(
     yield from takeoff_notes(values)
     yield from clipped_note(values, "ATC_RATE_Y_MAX", "PILOT_Y_RATE")
     yield from _timeout_notes(values, context)
-    for names, unknown in (
-        (_RISK_NAMES, "it holds its last sticks for ever if this computer dies"),
-        (SIMPLE_NAMES, f"{TURNED}the heading at arming"),
-    ):
-        if missing := [name for name in names if name not in values]:
-            said = f"the vehicle has not sent {', '.join(missing)}: whether {unknown} is not known"
-            yield ParamNote("advice", tuple(missing), said)
     landing = values.get("FS_OPTIONS", _CONTINUE_LANDING)
     yield ParamNote("wanted", ("FS_OPTIONS",), "any" if context.has_receiver else "24 (bit 3 set)")
     if context.has_receiver is False and not int(landing) & _CONTINUE_LANDING:

@@ -78,7 +78,12 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
     except ValueError as error:
         unusable = str(error) if is_override else None
     switch = profile.traits(values).override_switch if is_override else None
-    all_notes, accepted = (*context.serial, *profile.notes(values, context)), context.accepted_risks
+    all_notes, accepted = [*context.serial, *profile.notes(values, context)], context.accepted_risks
+    wanted = [note.names[0] for note in all_notes if note.kind == "wanted"]
+    if unread := tuple(name for name in wanted if name not in values):
+        effect = "whether it flies as told, and what it does if this computer dies, is not known"
+        said = f"the vehicle has not sent {', '.join(unread)}: {effect} (mavbridge check)"
+        all_notes.append(ParamNote("advice", unread, said))
     notes = tuple(note.accepted() if note.risk in accepted else note for note in all_notes)
     return Assessment(context, ours, unusable, switch, notes)
 

@@ -132,8 +132,9 @@ def test_a_serial_port_must_carry_what_is_asked_for(
 
 
 def px4_vehicle(changes: dict[str, float | None] | None = None, **settings: Any) -> ParamVehicle:
-    values = {"COM_RC_IN_MODE": 1.0, "COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}
-    values |= {name: value for name, value in (changes or {}).items() if value is not None}
+    usual = {"COM_RC_IN_MODE": 1.0, "COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}
+    found: dict[str, float | None] = {**usual, **(changes or {})}
+    values = {name: value for name, value in found.items() if value is not None}
     output: Output = settings.pop("output", "manual-control")
     return ParamVehicle(profile=PX4, output=output, values=values, **settings)
 
@@ -148,11 +149,27 @@ def test_a_receiver_that_is_switched_on_in_flight_is_an_obstacle_after_it() -> N
     assert vehicle.problem().code is Code.OBSTACLE
 
 
-def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> None:
-    vehicle = ParamVehicle({"FS_THR_ENABLE": None})
+@pytest.mark.parametrize(
+    ("vehicle", "unread"),
+    [
+        (ParamVehicle({"FS_THR_ENABLE": None}), "FS_THR_ENABLE"),
+        (ParamVehicle({"GUID_TIMEOUT": None}, output="velocity"), "GUID_TIMEOUT"),
+        (ParamVehicle({}, output="velocity"), None),
+        (
+            px4_vehicle({"COM_RC_IN_MODE": None, "COM_RCL_EXCEPT": 2.0, "COM_DISARM_PRFLT": 9.0}),
+            "COM_RC_IN_MODE",
+        ),
+        (px4_vehicle(output="velocity"), "COM_OF_LOSS_T, COM_OBL_RC_ACT, COM_RCL_EXCEPT"),
+    ],
+)
+def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning(
+    vehicle: ParamVehicle, unread: str | None
+) -> None:
     vehicle.run(10.0)
     assert vehicle.problem() is None
-    assert [text for text in vehicle.texts if "has not sent FS_THR_ENABLE" in text]
+    texts = [text for text in vehicle.texts if "has not sent" in text]
+    assert len(texts) == (unread is not None)
+    assert all(text.startswith(f"the vehicle has not sent {unread}: ") for text in texts)
     vehicle.armed = True
     vehicle.run(3.0)
     count = len(vehicle.requests)
