@@ -55,13 +55,9 @@ _NO_VELOCITY = 32
 _CONTINUE_LANDING = 8
 """Bit 3 of FS_OPTIONS."""
 
-_RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
-"""Parameters that decide a flight's safety: requested again if the first requests get lost."""
-
 _FIRST_NAMES = (
     *(f"RCMAP_{stick}" for stick in STICKS),
-    *_RISK_NAMES,
-    "FLTMODE_CH",
+    *("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE", "FLTMODE_CH"),
     *("RC_FS_TIMEOUT", "FS_THR_VALUE", "FS_OPTIONS", "THR_DZ", "MAV_GCS_SYSID_HI"),
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER", "Q_ENABLE"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO", "ATC_RATE_Y_MAX"),
@@ -128,9 +124,8 @@ class ArduPilot(Profile):
         )
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the channels' parameters, and those that decide a flight's safety."""
-        thrust_names = ("GUID_OPTIONS", "ATC_ANGLE_BOOST", "MOT_THST_HOVER")
-        return (*stick_names(values, "OPTION"), *SIMPLE_NAMES, *_RISK_NAMES, *thrust_names)
+        """See `Profile`."""
+        return (*super().needed_params(values), *stick_names(values, "OPTION"), *SIMPLE_NAMES)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """Return the calibration from RCMAP_* and RCn_*."""

@@ -277,8 +277,9 @@ class Profile(ABC):
         return self.stick_echo
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return more parameters, by values of others; asked for on the ground until they come."""
-        return ()
+        """Return parameters, by values of others, to ask for on the ground until they come, as for
+        those with a wanted value."""
+        return (self.hover_param,)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration | None:
         """Return the radio calibration; None if sticks do not pass through one.

@@ -184,7 +184,6 @@ class Px4(Profile):
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
         *("MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
         *("COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
-        *("MIS_TAKEOFF_ALT", "MPC_XY_MAN_EXPO", "MPC_VEL_MANUAL"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
         *("MAN_KILL_GEST_T", "MPC_TILTMAX_AIR", "MC_YAWRATE_MAX", "MPC_THR_CURVE"),
@@ -213,10 +212,6 @@ class Px4(Profile):
             *condition_streams("ESTIMATOR_STATUS"),
             StreamGroup(("GLOBAL_POSITION_INT",), 2.0, least_hz=0.0),
         )
-
-    def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the parameters for the source of sticks and for hover thrust."""
-        return ("COM_RC_IN_MODE", "MPC_THR_HOVER")
 
     def traits(self, values: Mapping[str, float]) -> Traits:
         """See `Profile`. Below 0, limits of climb and descent would reverse the motion."""

@@ -46,6 +46,8 @@ class Assessment(NamedTuple):
     """Number of the channel that enables the output."""
     notes: tuple[ParamNote, ...]
     """All notes; those of kind risk are not accepted."""
+    unread: tuple[str, ...]
+    """Parameters with a wanted value that the vehicle has not sent."""
 
     @property
     def obstacles(self) -> tuple[ParamNote, ...]:
@@ -85,7 +87,7 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
         said = f"the vehicle has not sent {', '.join(unread)}: {effect} (mavbridge check)"
         all_notes.append(ParamNote("advice", unread, said))
     notes = tuple(note.accepted() if note.risk in accepted else note for note in all_notes)
-    return Assessment(context, ours, unusable, switch, notes)
+    return Assessment(context, ours, unusable, switch, notes, unread)
 
 
 def received_bytes_per_s(streams: Iterable[StreamGroup], frame_bytes: int = _FRAME_BYTES) -> float:
@@ -288,7 +290,8 @@ class VehicleParams:
             return
         self._again_ns, self._rounds = now_ns + _AGAIN_NS, self._rounds + self.is_read
         others = self._relevant if self._rounds.bit_count() == 1 else ()
-        self._read((*self._profile.needed_params(self.values), *others))
+        unread = self._assessed.unread if self._assessed else ()
+        self._read((*self._profile.needed_params(self.values), *unread, *others))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
         """Adopt the calibration that was read, at the start or when next disarmed."""
