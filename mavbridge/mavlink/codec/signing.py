@@ -117,8 +117,8 @@ class Signing:
 
     @property
     def now_ticks(self) -> int:
-        """Wall time as a timestamp."""
-        return max((self._unix_ns() - EPOCH_NS) // TICK_NS, 0)
+        """Wall time as a timestamp, within its bits."""
+        return min(max((self._unix_ns() - EPOCH_NS) // TICK_NS, 0), LATEST_TICKS)
 
     def _hash(self, signed: bytes) -> bytes:
         return hashlib.sha256(self._key + signed).digest()[:_HASH_BYTES]

@@ -112,6 +112,9 @@ class Connection:
         """First refused send since the last successful one."""
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
+        self._caller: Address | None = None
+        """Newest sender, who gets our heartbeats before that: a vehicle that signs may have its
+        time from them."""
         self._texts: list[str] = []
         self._advice: set[str] = set()
         """Advice already given."""
@@ -194,7 +197,7 @@ class Connection:
             for data, arrived_ns, sender in self._transport.drain():
                 self.received_bytes += len(data)
                 self._told_loss = self.loss = ""
-                is_stream = sender is None
+                self._caller, is_stream = sender, sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data, sender):
                     self.received_packets += message.name != UNKNOWN
@@ -244,7 +247,7 @@ class Connection:
         if self.is_down:
             return False
         try:
-            is_sent = self._transport.send(data, self.peer)
+            is_sent = self._transport.send(data, self.peer or self._caller)
         except TransportDownError as error:
             self._lose(error, self._clock.now_ns())
             return False

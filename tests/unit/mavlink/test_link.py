@@ -13,6 +13,7 @@ from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.link_settings import LinkSettings
+from mavbridge.core.processes import free_port
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
@@ -26,6 +27,8 @@ from mavbridge.core.vehicle import (
     Sample,
     Sticks,
 )
+from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import EPOCH_NS, Signing
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import Address, Received, TransportDownError
@@ -482,3 +485,28 @@ def test_a_system_that_refuses_every_packet_is_told() -> None:
     with pytest.raises(PeerError, match=r"refuses to send there \((Permission|Network)"):
         link.service()
     link.close()
+
+
+@pytest.mark.parametrize("behind_s", [0, 3600])
+def test_a_vehicle_whose_signing_clock_is_behind_gets_the_time_from_us(behind_s: int) -> None:
+    """After a reboot PX4 signs by its stored time, until it hears a signed packet."""
+    clock, port, key, now_ns = FakeClock(), free_port(), bytes(range(32)), EPOCH_NS + 10**18
+    ours = Signing(key, unix_ns=lambda: now_ns)
+    settings = LinkSettings(connect=f"udp:127.0.0.1:{port}")
+    link = MavlinkLink(make_transport(settings.connect, clock), clock, settings, signing=ours)
+    behind = Signing(key, unix_ns=lambda: now_ns - behind_s * NS_PER_S)
+    vehicle = Codec(source_system=1, signing=behind)
+    end = make_transport(f"udpout:127.0.0.1:{port}", clock)
+    vehicle.source = Endpoint(1, 1)
+    end.open()
+    for _ in range(4):
+        beat = vehicle._pack(dialect.MAVLink_heartbeat_message, 0, 2, 3, 0, 4, 3)
+        end.send(beat)
+        link.receive()
+        link.service()
+        clock.advance_ns(1000 * MS)
+        for data, _, _ in end.drain():
+            list(vehicle.decode(data))
+    assert link.vehicle is not None
+    link.close()
+    end.close()

@@ -133,6 +133,8 @@ def test_our_timestamps_follow_the_clock_and_never_step_back():
     restarted = make_codec(day=TimeOfDay(EPOCH_NS - 1), state=SigningState(NOW_TICKS + 500))
     assert timestamp(restarted.encode_heartbeat()) == NOW_TICKS + 501
     assert timestamp(make_codec(day=TimeOfDay(0)).encode_heartbeat()) == 1
+    late = make_codec(day=TimeOfDay(EPOCH_NS + 2**48 * TICK_NS))  # in 2104
+    assert timestamp(late.encode_heartbeat()) == LATEST_TICKS
 
 
 @pytest.mark.parametrize("key", [KEY, None])
