@@ -67,6 +67,7 @@ class GuardProcess:
         self._port = SocketPort(ours, takes_files=True)
         self.samples = SocketPort(samples)
         """The vehicle's readings, for a ``TelemetryCache``."""
+        self._leftover = "; what --set has changed stays so" if settings.link.set_params else ""
         self._words = NO_WORDS
         self._outlet: int | None = None
         """Duplicate of the guard's socket or port while it holds the vehicle."""
@@ -147,7 +148,7 @@ class GuardProcess:
             by = f" (signal {-code})" if code is not None and code < 0 else ""
             if stands_still:
                 by = f", killed after {SILENT_WAITS * LISTEN_S:g} s in which it stood still"
-            raise GuardDiedError(f"the guard process has died{by}: {left}")
+            raise GuardDiedError(f"the guard process has died{by}: {left}{self._leftover}")
         if self.summary is not None and self.summary.outcome.failure is not None:
             raise PeerError(str(self.summary.outcome.failure))
 

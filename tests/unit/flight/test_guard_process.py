@@ -87,17 +87,16 @@ class Rig:
 
 
 @pytest.fixture
-def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    made = Rig()
+def rig(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    made, set_params = Rig(), getattr(request, "param", ())
 
     def spawn(ends: tuple[socket.socket, socket.socket], _settings: GuardSettings) -> Any:
         made.port = SocketPort(ends[0].dup())
         return made.child
 
     monkeypatch.setattr(guard_process, "_spawn", spawn)
-    made.guard = GuardProcess(
-        GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:1")), made.clock
-    )
+    link = LinkSettings(connect="udp:127.0.0.1:1", set_params=set_params)
+    made.guard = GuardProcess(GuardSettings(link=link), made.clock)
     yield made
     made.port.close()
     made.child.returncode = 0
@@ -164,6 +163,14 @@ def test_the_last_words_leave_by_the_link_of_a_guard_that_is_gone(rig: Rig, link
     assert rig.clock.now_ns() == START_NS + 100 * MS
     assert "signal 9" in text
     assert "BRAKE" in text
+
+
+@pytest.mark.parametrize("rig", [(), (("GUID_OPTIONS", 8.0),)], indirect=True)
+def test_what_set_has_changed_is_told_to_stay_as_a_dead_guard_left_it(
+    rig: Rig, request: pytest.FixtureRequest
+) -> None:
+    is_set = bool(request.node.callspec.params["rig"])
+    assert rig.die().endswith("; what --set has changed stays so") is is_set
 
 
 def test_newer_words_replace_those_before_and_keep_the_link(rig: Rig, link: Link) -> None:
