@@ -178,13 +178,9 @@ def _override_notes(
     if (low := values.get(name)) is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
         if not low <= context.source_system <= high:
-            yield ParamNote(
-                "obstacle",
-                ("MAV_GCS_SYSID", "SYSID_MYGCS"),
-                f"it obeys system {low:.0f} and we are system {context.source_system}",
-                f"--set-config link.source_system={low:.0f}",
-                ", or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)",
-            )
+            said = f"it obeys system {low:.0f} and we are system {context.source_system}"
+            cure, or_else = f"--set-config link.source_system={low:.0f}", f", or set {name}"
+            yield ParamNote("obstacle", (name,), said, cure, or_else)
     yield ParamNote("wanted", ("RC_OPTIONS",), "bit 1 clear")
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:
@@ -204,12 +200,9 @@ def _override_notes(
     if switch is not None:
         yield ParamNote("wanted", (f"RC{switch}_OPTION",), "46, with its switch on")
     elif context.has_receiver:
-        yield ParamNote(
-            "hint",
-            ("RCn_OPTION",),
-            "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
-            "autopilot itself, whatever happens here",
-        )
+        said = "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
+        said += "autopilot itself, whatever happens here"
+        yield ParamNote("hint", ("RCn_OPTION",), said)
 
 
 def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
@@ -228,10 +221,8 @@ def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterat
     failsafe = "not 0" if context.has_receiver else "not 0, without a receiver"
     yield ParamNote("wanted", ("FS_THR_ENABLE",), failsafe)
     if values.get("FS_THR_ENABLE") == 0 and context.has_receiver is not True:
-        why = because(Code.NO_THROTTLE_FAILSAFE)
-        yield ParamNote.of_risk(
-            "no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1"
-        )
+        why, name = because(Code.NO_THROTTLE_FAILSAFE), "FS_THR_ENABLE"
+        yield ParamNote.of_risk("no-throttle-failsafe", why, name, f"--set {name}=1")
 
 
 def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:

@@ -209,12 +209,10 @@ def stick_notes(values: Mapping[str, float]) -> Iterator[ParamNote]:
         )
         shorter_us = min(trim - low, high - trim)
         if stick != "RCMAP_THROTTLE" and low < high and 0 <= shorter_us <= dead:
-            yield ParamNote(
-                "obstacle",
-                (f"RC{number:g}_DZ", f"RC{number:g}_TRIM"),
-                f"RC{number:g} goes from {low:g} to {high:g} us around {trim:g}, and its dead zone "
-                f"of {dead:g} us hides one half of the stick of {stick}: calibrate the radio",
-            )
+            name = f"RC{number:g}"
+            said = f"{name} goes from {low:g} to {high:g} us around {trim:g}, and its dead zone of "
+            said += f"{dead:g} us hides one half of the stick of {stick}: calibrate the radio"
+            yield ParamNote("obstacle", (f"{name}_DZ", f"{name}_TRIM"), said)
     if (channel := values.get("FLTMODE_CH")) in sticks:
         effect = f": the stick of {sticks[channel]} would change the flight mode"
         free = next((number for number in range(5, 9) if number not in sticks), 0)

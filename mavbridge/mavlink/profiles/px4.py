@@ -182,8 +182,7 @@ class Px4(Profile):
     params = (
         *("COM_RC_IN_MODE", "COM_RC_LOSS_T", "COM_RCL_EXCEPT", "NAV_RCL_ACT", "COM_FAIL_ACT_T"),
         *("COM_OF_LOSS_T", "COM_OBL_RC_ACT", "COM_DISARM_PRFLT", "COM_DISARM_LAND"),
-        *("MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER"),
-        *("COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
+        *("MAN_OVERRIDE_SPD", "NAV_DLL_ACT", "MPC_THR_HOVER", "COM_RC_OVERRIDE", "COM_RC_STICK_OV"),
         *("MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_YAW_EXPO", "MPC_Z_MAN_EXPO"),
         *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MAN_DEADZONE", "MPC_HOLD_DZ"),
         *("MAN_KILL_GEST_T", "MPC_TILTMAX_AIR", "MC_YAWRATE_MAX", "MPC_THR_CURVE"),
@@ -331,10 +330,8 @@ def _stick_notes(values: Mapping[str, float], context: ParamContext) -> Iterator
         effect = ": PX4 ignores our sticks if the receiver was there first"
         yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect, 1, or_else)
     if mode in _MAVLINK_FIRST and context.has_receiver:
-        effect = (
-            ": while our sticks flow PX4 ignores all switches of the transmitter: take over by "
-            "--engage-channel; they count 0.6 s later, once moved"
-        )
+        effect = ": while our sticks flow PX4 ignores all switches of the transmitter: take over "
+        effect += "by --engage-channel; they count 0.6 s later, once moved"
         yield ParamNote.of("advice", "COM_RC_IN_MODE", mode, effect)
     yield from clipped_note(values, "MPC_TILTMAX_AIR", "MPC_MAN_TILT_MAX")
     yield from clipped_note(values, "MC_YAWRATE_MAX", "MPC_MAN_Y_MAX")
