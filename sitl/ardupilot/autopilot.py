@@ -15,8 +15,6 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
 from sitl.vehicle.firmware import STOPPED, Autopilot, Severity
 
-GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz
-
 
 class RadioFailsafe:
     """Failsafe for sticks absent for RC_FS_TIMEOUT."""
@@ -37,44 +35,11 @@ class RadioFailsafe:
         return self.active != was_active
 
 
-class GcsFailsafe:
-    """Failsafe for a ground station that sends no heartbeat and no override for FS_GCS_TIMEOUT."""
-
-    def __init__(self, params: ArduPilotParams) -> None:
-        self._params = params
-        self._last_contact_ns: int | None = None
-        self._due_ns = 0
-        self.active = False
-
-    def on_contact(self, now_ns: int) -> None:
-        self._last_contact_ns = now_ns
-
-    def update(self, now_ns: int) -> bool:
-        """Check the timer if it is due. Return True if ``active`` has changed.
-
-        Disabled while active, the failsafe stays active and arming is refused until the next boot,
-        or until it is enabled again and hears the ground station.
-        """
-        if now_ns < self._due_ns or not self._params["FS_GCS_ENABLE"]:
-            return False
-        self._due_ns = now_ns + GCS_CHECK_PERIOD_NS
-        was_active = self.active
-        self.active = (
-            self._last_contact_ns is not None
-            and now_ns - self._last_contact_ns > self._params["FS_GCS_TIMEOUT"] * NS_PER_S
-        )
-        return self.active != was_active
-
-
-FAILSAFE_MODES = {
-    "FS_THR_ENABLE": {3: Mode.LAND, 7: Mode.BRAKE},
-    "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
-}
-"""Mode that each value of the parameter selects; all other values but 0 mean RTL."""
+FAILSAFE_MODES = {3: Mode.LAND, 7: Mode.BRAKE}
+"""Mode that each value of FS_THR_ENABLE selects; all other values but 0 mean RTL."""
 LAND_DELAY_NS = 4 * NS_PER_S  # LAND_WITH_DELAY_MS: time for the pilot to take over
 FS_OPTION_GUIDED = 4  # GUIDED continues without the pilot's sticks
 FS_OPTION_LANDING_CONTINUES = 8
-FS_OPTION_PILOT_CONTINUES = 16
 
 
 class ArduCopter(Autopilot):
@@ -91,7 +56,6 @@ class ArduCopter(Autopilot):
         self.mode = Mode.STABILIZE
         self.rc = RcEngine(params, self.receiver)
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
-        self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
         self._idle_since_ns = self._armed_ns = boot_ns
@@ -121,8 +85,6 @@ class ArduCopter(Autopilot):
             return "RC not found"
         if self.radio_failsafe.active:
             return "Radio failsafe on"
-        if self.gcs_failsafe.active:
-            return "GCS failsafe on"
         return None
 
     def _stick_refusal(self) -> str | None:
@@ -196,9 +158,15 @@ class ArduCopter(Autopilot):
         return True
 
     def _read_inputs(self) -> None:
-        self._read_radio()
-        if self.gcs_failsafe.update(self.now_ns):
-            self._on_gcs_change()
+        changed = self.radio_failsafe.update(
+            new_input=self.rc.update(self.now_ns),
+            can_fail=self.rc.found or self.armed,
+            now_ns=self.now_ns,
+        )
+        if changed and self.radio_failsafe.active:
+            self._fail_over()
+        elif changed:
+            self.send_text(Severity.WARNING, "Radio Failsafe Cleared")
 
     def _start_in_air(self) -> None:
         """Fly on in ALT_HOLD, or in a mode flown by setpoints. An idle receiver commands a
@@ -242,47 +210,23 @@ class ArduCopter(Autopilot):
     def _is_pushing(self) -> bool:
         return self.control.collective > 0.5 * self.params["MOT_THST_HOVER"]
 
-    def _read_radio(self) -> None:
-        changed = self.radio_failsafe.update(
-            new_input=self.rc.update(self.now_ns),
-            can_fail=self.rc.found or self.armed,
-            now_ns=self.now_ns,
-        )
-        if not changed:
-            return
-        if self.radio_failsafe.active:
-            self._fail_over("Radio", "FS_THR_ENABLE")
-        else:
-            self.send_text(Severity.WARNING, "Radio Failsafe Cleared")
-
-    def _on_gcs_change(self) -> None:
-        if not self.gcs_failsafe.active:
-            self.send_text(Severity.WARNING, "GCS Failsafe Cleared")
-            return
-        self.rc.clear_overrides()
-        continues = self.params.integer("FS_OPTIONS") & FS_OPTION_PILOT_CONTINUES
-        if self.armed and self.mode.piloted and continues:
-            self.send_text(Severity.WARNING, "GCS Failsafe - Continuing Pilot Control")
-        else:
-            self._fail_over("GCS", "FS_GCS_ENABLE")
-
-    def _fail_over(self, who: str, parameter: str) -> None:
+    def _fail_over(self) -> None:
         """Land, brake or return as the parameters say; the mode stays after the cause has gone."""
         if self.armed and self.landed:
-            self.send_text(Severity.WARNING, f"{who} Failsafe - Disarming")
+            self.send_text(Severity.WARNING, "Radio Failsafe - Disarming")
             self.disarm(force=True)
             return
         options = self.params.integer("FS_OPTIONS")
         if self.armed and self.mode is Mode.LAND and options & FS_OPTION_LANDING_CONTINUES:
-            self.send_text(Severity.WARNING, f"{who} Failsafe - Continuing Landing")
+            self.send_text(Severity.WARNING, "Radio Failsafe - Continuing Landing")
             return
-        if self.armed and self.mode.is_guided and who == "Radio" and options & FS_OPTION_GUIDED:
+        if self.armed and self.mode.is_guided and options & FS_OPTION_GUIDED:
             self.send_text(Severity.WARNING, "Radio Failsafe - Continuing Guided Mode")
             return
-        self.send_text(Severity.WARNING, f"{who} Failsafe")
+        self.send_text(Severity.WARNING, "Radio Failsafe")
         if not self.armed:
             return
-        mode = FAILSAFE_MODES[parameter].get(self.params.integer(parameter), Mode.RTL)
+        mode = FAILSAFE_MODES.get(self.params.integer("FS_THR_ENABLE"), Mode.RTL)
         before = self.mode
         self.set_mode(mode if self.position_ready else Mode.LAND)
         if self.mode is Mode.LAND is not before:

@@ -54,7 +54,7 @@ class ArduPilotTelemetry(Telemetry[ArduCopter]):
         if ap.armed:
             base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
             status = mav.MAV_STATE_ACTIVE
-        if ap.radio_failsafe.active or ap.gcs_failsafe.active:
+        if ap.radio_failsafe.active:
             status = mav.MAV_STATE_CRITICAL
         kind = (mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_ARDUPILOTMEGA)
         return (*kind, base_mode, int(ap.mode), status, 3)

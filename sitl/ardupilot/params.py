@@ -19,9 +19,7 @@ _FIXED = {
     "ATC_RATE_Y_MAX": 0.0,  # deg/s, in GUIDED only; 0: no limit
     "DISARM_DELAY": 10.0,  # s
     "FLTMODE_CH": 5.0,  # stored only: no switch changes the mode
-    "FS_GCS_ENABLE": 0.0,  # 0 off, 1 RTL, 5 LAND, 7 BRAKE
-    "FS_GCS_TIMEOUT": 5.0,  # s
-    "FS_OPTIONS": 16.0,  # bit 2: GUIDED continues; 3: a landing; 4: the pilot after GCS loss
+    "FS_OPTIONS": 16.0,  # bit 2: GUIDED continues; 3: a landing
     "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND, 7 BRAKE
     "FS_THR_VALUE": 975.0,  # us; stored only
     "GUID_OPTIONS": 0.0,  # bit 3: SET_ATTITUDE_TARGET.thrust is thrust, not a climb rate

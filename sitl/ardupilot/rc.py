@@ -66,9 +66,6 @@ class RcEngine:
                 self._override_ns[index] = now_ns
                 self._fresh_override = self._was_overridden = True
 
-    def clear_overrides(self) -> None:
-        self._override_us = [RELEASE] * CHANNELS
-
     def index_of(self, axis: str) -> int:
         """Return the zero-based channel of one of ``STICKS``, by RCMAP_* at boot."""
         return self._indices[axis]
@@ -119,7 +116,7 @@ class RcEngine:
         if side and now_ns - self._switch_since_ns >= DEBOUNCE_NS:
             self._takes_overrides = side > 0
             if not self._takes_overrides:
-                self.clear_overrides()
+                self._override_us = [RELEASE] * CHANNELS
 
 
 THROTTLE_FULL = 1000.0

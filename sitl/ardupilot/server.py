@@ -74,14 +74,9 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         high = max(low, int(self._ap.params.get("MAV_GCS_SYSID_HI", 0.0)))
         return low <= int(message.get_srcSystem()) <= high
 
-    def on_heartbeat(self, _link: ArduPilotEndpoint, message: Message) -> None:
-        if self._is_from_gcs(message):
-            self._ap.gcs_failsafe.on_contact(self._arrived_ns)
-
     def on_rc_channels_override(self, _link: ArduPilotEndpoint, message: Message) -> None:
         if not self._is_from_gcs(message):
             return
-        self._ap.gcs_failsafe.on_contact(self._arrived_ns)
         raw_us = [getattr(message, f"chan{n + 1}_raw") for n in range(OVERRIDDEN_CHANNELS)]
         if set(raw_us) - {RELEASE, IGNORE}:
             self._log.overrides += 1

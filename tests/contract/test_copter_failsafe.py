@@ -1,18 +1,17 @@
-"""Loss of sticks or of the ground station, as measured on ArduCopter."""
+"""Loss of sticks, as measured on ArduCopter."""
 
 import math
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.contract_peers import GCS, last, named, texts_in
+from helpers.contract_peers import last, named, texts_in
 from helpers.copter_companion import (
     ACCEPTED,
     ACRO,
     ALT_HOLD,
     BRAKE,
     FAILED,
-    GUIDED_NOGPS,
     LAND,
     RTL,
     STABILIZE,
@@ -26,10 +25,6 @@ def modes(messages):
     return [m.custom_mode for m in named(messages, "HEARTBEAT")]
 
 
-def heartbeat(companion, system_id=GCS):
-    companion.send(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), system_id=system_id)
-
-
 def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(flying):
     flying.hold(1.0, roll=1700)
     held = flying.advance(2.9)
@@ -39,56 +34,6 @@ def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(fl
     assert last(released, "LOCAL_POSITION_NED").vz == pytest.approx(IDLE_DESCENT_MPS, abs=0.35)
     assert set(modes(held + released)) == {ALT_HOLD}
     assert not [text for text in texts_in(held + released) if "ailsafe" in text]
-
-
-def watch_the_ground_station(companion):
-    companion.set_param("FS_GCS_TIMEOUT", 1.0)
-    companion.set_param("FS_GCS_ENABLE", 1)
-    heartbeat(companion)
-
-
-def wait_for_text(companion, text):
-    """The next status text, within the time of the failsafe and what a busy computer adds."""
-    return companion.wait("STATUSTEXT", timeout_s=4.0, where=lambda m: m.text == text)
-
-
-def test_overrides_are_contact_with_the_ground_station_and_heartbeats_of_others_are_not(flying):
-    watch_the_ground_station(flying)
-    assert not [text for text in texts_in(flying.hold(2.0)) if "GCS" in text]
-    messages = []
-    for _ in range(20):
-        heartbeat(flying, system_id=42)
-        messages += flying.advance(0.1)
-    assert "GCS Failsafe - Continuing Pilot Control" in texts_in(messages)
-    assert set(modes(messages)) == {ALT_HOLD}
-    heartbeat(flying)
-    wait_for_text(flying, "GCS Failsafe Cleared")
-
-
-def test_the_ground_stations_failsafe_drops_overrides_and_stays_when_switched_off(flying):
-    flying.set_param("RC_OVERRIDE_TIME", 10.0)
-    watch_the_ground_station(flying)
-    flying.hold(0.3, roll=1600, thr=1500)
-    wait_for_text(flying, "GCS Failsafe - Continuing Pilot Control")
-    assert last(flying.advance(0.2), "RC_CHANNELS").chan1_raw == 1500
-    flying.set_param("FS_GCS_ENABLE", 0)
-    messages = []
-    for _ in range(8):
-        heartbeat(flying)
-        messages += flying.hold(0.1)
-    assert last(messages, "HEARTBEAT").system_status == mav.MAV_STATE_CRITICAL
-    flying.set_param("FS_GCS_ENABLE", 1)
-    heartbeat(flying)
-    wait_for_text(flying, "GCS Failsafe Cleared")
-
-
-def test_lost_ground_station_in_guided_returns(flying):
-    watch_the_ground_station(flying)
-    assert flying.set_mode(GUIDED_NOGPS) == ACCEPTED
-    wait_for_text(flying, "GCS Failsafe")
-    assert flying.wait("HEARTBEAT").custom_mode == RTL
-    heartbeat(flying)
-    wait_for_text(flying, "GCS Failsafe Cleared")
 
 
 @pytest.fixture

@@ -380,7 +380,8 @@ def test_a_failsafe_of_the_vehicle_is_left_alone(
     if flight.is_px4:
         flight.px4.lost_sticks.phase = LostPhase.ACTING
     else:
-        flight.ardupilot.gcs_failsafe.active = True
+        failsafe = flight.ardupilot.radio_failsafe
+        failsafe.active, failsafe.update = True, lambda **_: False  # type: ignore[method-assign]
         flight.ardupilot.set_mode(ArduMode.RTL)
     flight.run(1.5)
     assert flight.samples[-1].mode == ("AUTO.RTL" if flight.is_px4 else "RTL")

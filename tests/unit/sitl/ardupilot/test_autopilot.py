@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sitl.ardupilot.flight_modes import Mode
-from sitl.vehicle.config import IDLE_RECEIVER_US, VehicleConfig
+from sitl.vehicle.config import VehicleConfig
 
 
 def test_rtl_comes_home_and_lands(pilot):
@@ -54,24 +54,13 @@ def test_a_lost_position_levels_the_vehicle_and_refuses_position_modes(pilot):
 
 
 @pytest.mark.parametrize(
-    ("parameter", "choice", "mode"),
-    [
-        ("FS_THR_ENABLE", 0, Mode.ALT_HOLD),
-        ("FS_THR_ENABLE", 1, Mode.RTL),
-        ("FS_THR_ENABLE", 3, Mode.LAND),
-        ("FS_THR_ENABLE", 7, Mode.BRAKE),
-        ("FS_GCS_ENABLE", 1, Mode.RTL),
-        ("FS_GCS_ENABLE", 5, Mode.LAND),
-    ],
+    ("choice", "mode"), [(0, Mode.ALT_HOLD), (1, Mode.RTL), (3, Mode.LAND), (7, Mode.BRAKE)]
 )
-def test_a_parameter_selects_the_mode_of_a_failsafe(pilot, parameter, choice, mode):
-    is_of_gcs = parameter == "FS_GCS_ENABLE"
-    pilot = type(pilot)(VehicleConfig(receiver_us=IDLE_RECEIVER_US if is_of_gcs else None))
-    pilot.ap.params.set(parameter, float(choice))
-    pilot.ap.params.set("FS_OPTIONS", 0.0)
+def test_a_parameter_selects_the_mode_of_a_failsafe(pilot, choice, mode):
+    pilot = type(pilot)(VehicleConfig(receiver_us=None))
+    pilot.ap.params.set("FS_THR_ENABLE", float(choice))
     pilot.take_off()
-    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
-    pilot.silence(5.5 if is_of_gcs else 1.5)
+    pilot.silence(1.5)
     assert pilot.ap.mode is mode
 
 
