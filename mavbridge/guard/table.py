@@ -131,9 +131,10 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
 
     The mode was changed, and not by a request of ours that took effect within 1.5 s; the vehicle
     was armed in another mode, disarmed, rebooted, is in a failsafe that changes the mode (PX4: any)
-    or follows other sticks; the override switch is low (setpoints ignore it); the engage switch is
-    low (in flight or while engaging; PX4: while held); the vehicle is silent while another one uses
-    its system id; or a relevant parameter was changed.
+    or follows other sticks (a resting receiver's: only while it hears ours); the override switch is
+    low (setpoints ignore it); the engage switch is low (in flight or while engaging; PX4: while
+    held); the vehicle is silent while another one uses its system id; or a relevant parameter was
+    changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None

@@ -150,6 +150,16 @@ def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again(seconds: fl
     assert moves[11].control is RELEASE, "the next hand needs its own EVENT"
 
 
+def test_no_event_is_needed_for_a_jump_from_sticks_that_were_missed() -> None:
+    stepped = held_by_px4(5.0)
+    stepped.run(0.1, problem=LOST)
+    moves = left_for_a_hand(stepped, None, problem=None)
+    assert "AUTO.LOITER" in {move.mode for move in moves}
+    assert {move.control for move in moves} == {NEUTRAL}
+    stepped.run(1.1, mode="AUTO.LOITER")
+    assert left_for_a_hand(stepped, None)[0].control is RELEASE
+
+
 @pytest.mark.parametrize(
     ("told_ns", "seconds", "changes", "waits"),
     [
