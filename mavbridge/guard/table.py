@@ -36,6 +36,8 @@ NOT_SET = (Code.SET_ABSENT, Code.SET_REFUSED, Code.SET_UNANSWERED)
 LOST_NS = 30 * NS_PER_S
 """Silence of a held vehicle after which it counts as lost, and holding it ends; and longest wait if
 it does not even show our last sticks, since it may not hear the releases either."""
+UNSEEN_RELEASE_NS = 4 * NS_PER_S
+"""That wait without a receiver: the vehicle's failsafe has acted by then, and its sticks stay."""
 UNSEEN_NS = 2 * GAP_NS
 """Time without a reading after which the engage switch counts as dead: 20 periods of RC_CHANNELS at
 the lowest requested rate."""
@@ -203,14 +205,15 @@ def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
-    30 s if it does not even show our last sticks; the outcome then says that the release was not
-    seen. PX4's failsafe for lack of sticks is undone first, for 1.5 s.
+    30 s with a receiver, else 4 s, if it does not even show our last sticks; the outcome then says
+    that the release was not seen. PX4's failsafe for lack of sticks is undone first, for 1.5 s.
     """
     if m.lost_mode(now) is not None:
         return False
     if now.link.is_released and not m.owes_release:
         return True
-    is_lost = now.now_ns - min(m.released_ns, m.heard_ns) >= LOST_NS
+    most_ns = LOST_NS if now.status.has_receiver else UNSEEN_RELEASE_NS
+    is_lost = now.now_ns - min(m.released_ns, m.heard_ns) >= most_ns
     is_over = now.now_ns - m.released_ns >= RELEASE_TIMEOUT_NS
     return is_over and (now.link.shows_last or is_lost)
 

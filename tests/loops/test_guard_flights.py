@@ -99,6 +99,19 @@ def test_without_a_receiver_no_takeover_leaves_a_lean_behind() -> None:
     assert all(us[0] == us[1] == us[3] == 1500 for us in sticks)
 
 
+def test_without_a_receiver_a_release_that_cannot_be_seen_ends_and_lets_others_override() -> None:
+    """The vehicle shows for ever what it heard last, here older sticks than our last."""
+    flight = from_ground(has_receiver=False)
+    climb(flight)
+    since_ns = flight.clock.now_ns()
+    flight.up.is_silent = True
+    flight.until(lambda: flight.phase is Phase.RELEASING, within_s=1.2)
+    assert flight.ardupilot.mode is Mode.RTL
+    flight.up.is_silent = False
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=4.1)
+    assert 70 < overrides(flight, since_ns).count((0, 0, 0, 0)) <= 80
+
+
 def test_a_second_flight_without_a_receiver_is_held_at_its_end_as_the_first_was() -> None:
     """The end of an earlier flight's overrides is a radio failsafe while disarmed, too."""
     flight = from_ground(has_receiver=False)

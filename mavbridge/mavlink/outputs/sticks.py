@@ -142,8 +142,9 @@ class OverrideOutput(StickOutput):
         vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
 
     def must_release(self, sent: int, now_ns: int) -> bool:
-        """True for a while, and as long as the vehicle still holds sticks of ours."""
-        return super().must_release(sent, now_ns) or self.echo.is_held(now_ns)
+        """True for a while, and as long as sticks of ours are shown in place of a receiver's."""
+        has_receiver = self._status is not None and self._status.has_receiver
+        return super().must_release(sent, now_ns) or bool(has_receiver and self.echo.is_held(now_ns))
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
