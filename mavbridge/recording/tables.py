@@ -18,7 +18,6 @@ Row: TypeAlias = dict[str, object]
 """Values by column."""
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash can lose."""
-READ_ERRORS = (pa.ArrowException, OSError)
 _ADVICE = "another program or version wrote it"
 _ROWS_AT_ONCE = 4_096
 _GROUP_ROWS = 2_048

@@ -46,8 +46,8 @@ once at any rate."""
 
 _OVERRIDE_SWITCH_OPTION = 46
 """RCn_OPTION "RC Override Enable": overrides are refused while the switch is low."""
-_IGNORE_RECEIVER, _IGNORE_OVERRIDES = 1, 2
-"""Bits 0 and 1 of RC_OPTIONS."""
+_IGNORE_RECEIVER, _IGNORE_OVERRIDES, _REVERSE_SWITCHES = 1, 2, 128
+"""Bits 0, 1 and 7 of RC_OPTIONS."""
 _THRUST_AS_THRUST = 8
 """Bit 3 of GUID_OPTIONS; without it, thrust in SET_ATTITUDE_TARGET is a climb rate."""
 _NO_VELOCITY = 32
@@ -125,7 +125,10 @@ class ArduPilot(Profile):
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """See `Profile`."""
-        return (*super().needed_params(values), *stick_names(values, "OPTION"), *SIMPLE_NAMES)
+        switch = self.traits(values).override_switch
+        reversed_ = () if switch is None else (f"RC{switch}_REVERSED",)
+        others = (*super().needed_params(values), *reversed_, *SIMPLE_NAMES)
+        return (*stick_names(values, "OPTION"), *others)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
         """Return the calibration from RCMAP_* and RCn_*."""
@@ -183,9 +186,13 @@ def _override_notes(
             yield ParamNote("obstacle", (name,), said, cure, or_else)
     yield ParamNote("wanted", ("RC_OPTIONS",), "bit 1 clear")
     options = int(values.get("RC_OPTIONS", 0))
-    if options & _IGNORE_OVERRIDES:
-        effect, mended = ", whose bit 1 ignores overrides", options & ~_IGNORE_OVERRIDES
-        yield ParamNote.of("obstacle", "RC_OPTIONS", options, effect, mended)
+    reverses = _REVERSE_SWITCHES if values.get(f"RC{switch}_REVERSED") else 0
+    for bit, effect in (
+        (_IGNORE_OVERRIDES, ", whose bit 1 ignores overrides"),
+        (reverses, f", whose bit 7 reverses RC{switch}, the override switch"),
+    ):
+        if options & bit:
+            yield ParamNote.of("obstacle", "RC_OPTIONS", options, effect, options & ~bit)
     yield from map_notes(values, context.booted)
     yield from stick_notes(values)
     yield from takeoff_notes(values)

@@ -360,9 +360,7 @@ def _exception_notes(values: Mapping[str, float], bit: int, mode: str) -> Iterat
     yield ParamNote("wanted", ("COM_RCL_EXCEPT",), f"with {bit} in it")
     exceptions = values.get("COM_RCL_EXCEPT", bit)
     if not int(exceptions) & bit:
-        effect = (
-            f": sticks that were there at arming and end later are a failsafe in {mode} modes too"
-        )
+        effect = f": sticks seen at arming that end later are a failsafe in {mode} modes too"
         yield ParamNote.of("hint", "COM_RCL_EXCEPT", exceptions, effect, int(exceptions) | bit)
 
 

@@ -291,7 +291,7 @@ def test_all_is_read_before_the_output_is_known_and_nothing_is_read_twice() -> N
 
 def test_what_was_given_up_before_the_first_answer_is_read_after_it() -> None:
     """The first requests to an autopilot that boots get lost, and a gap of the link is as long."""
-    vehicle = ParamVehicle({"RC7_OPTION": 46.0, "PILOT_Y_RATE": 99.0})
+    vehicle = ParamVehicle({"RC7_OPTION": 46.0, "RC7_REVERSED": 1.0, "PILOT_Y_RATE": 99.0})
     answered, vehicle.values = vehicle.values, {}
     vehicle.run(6.0)
     assert vehicle.params.is_read
@@ -299,6 +299,7 @@ def test_what_was_given_up_before_the_first_answer_is_read_after_it() -> None:
     vehicle.run(3.0)
     assert set(vehicle.params.values) == set(answered) & vehicle.params._relevant
     assert vehicle.params.override_switch == 7
+    assert vehicle.params.values["RC7_REVERSED"] == 1.0
     assert vehicle.params.values["PILOT_Y_RATE"] == 99.0
 
 

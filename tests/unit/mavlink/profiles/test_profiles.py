@@ -202,6 +202,13 @@ def test_advice(
         ({"SYSID_MYGCS": 252.0}, "rc-override", "obeys system 252"),
         ({"RC_OPTIONS": 34.0}, "rc-override", "RC_OPTIONS is 34, .* bit 1 .* --set RC_OPTIONS=32"),
         ({"RC_OPTIONS": 32.0}, "rc-override", None),
+        *(
+            ({"RC8_OPTION": 46.0, "RC_OPTIONS": 160.0} | reversed_, "rc-override", told)
+            for reversed_, told in (
+                ({"RC8_REVERSED": 1.0}, "bit 7 reverses RC8.* --set RC_OPTIONS=32"),
+                ({"RC8_REVERSED": 0.0, "RC7_REVERSED": 1.0}, None),
+            )
+        ),
         ({"RC_OVERRIDE_TIME": 0.0}, "rc-override", "RC_OVERRIDE_TIME is 0"),
         # switches of the pilot's own
         *(
