@@ -143,8 +143,9 @@ class OverrideOutput(StickOutput):
 
     def must_release(self, sent: int, now_ns: int) -> bool:
         """True for a while, and as long as sticks of ours are shown in place of a receiver's."""
+        is_held = self.echo.is_held(now_ns)
         has_receiver = self._status is not None and self._status.has_receiver
-        return super().must_release(sent, now_ns) or bool(has_receiver and self.echo.is_held(now_ns))
+        return super().must_release(sent, now_ns) or bool(has_receiver and is_held)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
