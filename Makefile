@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PORT ?= 14550
 POLICY ?= toge
 # toge-rates flies races.
@@ -22,42 +21,49 @@ BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUI
 # One viewer a flight: FLAGS="--rerun connect" shows it and writes no file.
 SAVED := $(if $(findstring --rerun,$(FLAGS)),,--rerun out/flight.rrd)
 LANDED := $(if $(findstring --then,$(FLAGS)),,--then land)
-PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
+
+UNITS = $(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist loadfile -m 'not system' --ignore tests/system
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
-FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
+FLIGHTS = $(BIN)/pytest --numprocesses auto --maxprocesses 2 --dist worksteal -m system \
+	$(shell grep -rl mark.system tests --include='test_*.py') tests/system
+# Else each of the processes that tests start would compile the sources again.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Modules whose mutants are tried, as in MODULES=mavbridge/guard/guard.py; none = all of
 # tests/mutation/reasons.toml. ONLY=Guard.step: mutants whose name begins so.
 MODULES ?=
 ONLY ?=
 
-.PHONY: fly check test lint docs bench faults fuzz mutants dist clean
+.PHONY: fly check test lint style types docs bench faults fuzz mutants dist clean
+
+%/bin/pip:
+	$(PYTHON) -m venv $*
+
+# $(call install,ENVIRONMENT,PACKAGES): pip would compile on one core. A few packages bring templates
+# that are no Python.
+define install
+$(1)/bin/pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt $(2)
+$(1)/bin/python -m compileall -qq --workers 0 $(1)/lib || true
+endef
 
 # What flies, records and trains; `installed` adds what tests, plots and computes on many machines.
-$(VENV)/flies: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sitl,record,remote,screen,pilot]'
+FLIES := sitl,record,remote,screen,pilot
+$(VENV)/flies: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(call install,$(VENV),--editable '.[$(FLIES)]')
 	touch $@
 
-$(VENV)/installed: $(VENV)/flies
-	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,onnx,mcap,cluster,dev]'
-	touch $@
+ALL := $(FLIES),bench,onnx,mcap,cluster,docs,dev
+$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(call install,$(VENV),--editable '.[$(ALL)]')
+	touch $(VENV)/flies $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.
-.venv-peers/installed: constraints.txt
-	$(PYTHON) -m venv .venv-peers
-	.venv-peers/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		MAVProxy mavsdk
+.venv-peers/installed: constraints.txt | .venv-peers/bin/pip
+	$(call install,.venv-peers,MAVProxy mavsdk)
 	touch $@
 
-.venv-release/installed: constraints.txt
-	$(PYTHON) -m venv .venv-release
-	.venv-release/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		build check-wheel-contents pip-licenses twine
-	touch $@
-
-$(VENV)/documents: $(VENV)/installed
-	$(PIP) --editable '.[docs]'
+.venv-release/installed: constraints.txt | .venv-release/bin/pip
+	$(call install,.venv-release,build check-wheel-contents pip-licenses twine)
 	touch $@
 
 fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flying its course over UDP
@@ -74,19 +80,25 @@ fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flyi
 	[ ! -e out/flight.rrd ] || echo "wrote out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
 	exit $$status
 
-lint: $(VENV)/installed  ## format, lint, types, import direction
+lint: style types  ## format, lint, types, import direction
+
+style: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+types: $(VENV)/installed
+	$(BIN)/mypy
+
 check: lint  ## all of lint, then every test that needs no second process
-	$(BIN)/pytest $(PARALLEL) -m 'not system'
+	$(UNITS)
 
-test: .venv-peers/installed check docs  ## all of lint, then every test, and the site
-	$(BIN)/pytest $(FLIGHTS) -m system
+test:  ## all of lint, the site, then every test
+	$(MAKE) --jobs 2 --output-sync .venv-peers/installed lint docs
+	$(UNITS)
+	$(FLIGHTS)
 
-docs: $(VENV)/documents  ## the documentation as a site in out/site; warnings are errors
+docs: $(VENV)/installed  ## the documentation as a site in out/site; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, a flight and the link here, beside eager torch and peers

@@ -19,8 +19,6 @@ GLIBC = ("manylinux2014", *(f"manylinux_2_{minor}" for minor in range(17, 37)))
 """Tags up to glibc 2.36, that of Debian 12: Raspberry Pi OS and the image of our Dockerfile."""
 NO_NETWORK = re.compile(r"[^']*(new connection|resolve|timed out|unreachable)[^']*", re.IGNORECASE)
 
-pytestmark = pytest.mark.system
-
 
 def pins() -> dict[str, str]:
     """The pinned version of each package, by its canonical name."""

@@ -12,8 +12,6 @@ from helpers.status import told_by
 from mavbridge.core.processes import free_port
 from sitl.clock import Clock
 
-pytestmark = pytest.mark.system
-
 
 def test_help_of_fly_names_every_flag_of_the_contract() -> None:
     status, text = told_by("fly", "--help")

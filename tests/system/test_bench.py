@@ -1,10 +1,6 @@
 """Parts of ``make bench`` with their real processes."""
 
-import pytest
-
 from benchmarks.link import BARE_CLIENT, OUR_CLIENT, time_link
-
-pytestmark = pytest.mark.system
 
 
 def test_our_client_answers_the_vehicle_of_the_link_test() -> None:

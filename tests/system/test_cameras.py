@@ -21,8 +21,6 @@ from mavbridge.recording.flight_folder import open_flight
 from policy.data.flight_data import DatasetError
 from sitl.camera.shm import FramePublisher
 
-pytestmark = pytest.mark.system
-
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 
 

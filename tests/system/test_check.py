@@ -4,14 +4,11 @@ import json
 import sys
 from pathlib import Path
 
-import pytest
-
 from faults.stage import STARTS, VEHICLE, was_stalled
 from helpers.status import printed_by
 from mavbridge.core.errors import ExitCode
 from mavbridge.core.processes import free_port, running
 
-pytestmark = pytest.mark.system
 BLIND = ("--policy", "scripted:hover", "--camera", "none")
 
 

@@ -16,8 +16,6 @@ from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 
-pytestmark = pytest.mark.system
-
 TWO = WorkersConfig(workers=2)
 
 

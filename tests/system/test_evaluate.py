@@ -14,8 +14,6 @@ import pytest
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.stopping import INTERRUPTED, ONE_REQUEST_NS
 
-pytestmark = pytest.mark.system
-
 POLICY = """
 import os
 import threading

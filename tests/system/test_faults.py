@@ -9,8 +9,6 @@ import pytest
 from faults.run import MOST_STALL_MS, fly_scenario
 from faults.scenario import Scenario, load_catalogue
 
-pytestmark = pytest.mark.system
-
 SLACK_MS = 250.0
 """Added to the limits of the catalogue: other tests run on the same cores."""
 FLY_ON_S = 1.0

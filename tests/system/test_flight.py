@@ -3,15 +3,11 @@
 import signal
 from pathlib import Path
 
-import pytest
-
 from faults.processes import Process
 from faults.relay import Override, logged_overrides
 from faults.stage import ORDERLY, staged
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-
-pytestmark = pytest.mark.system
 
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 NEUTRAL = Override(1500, 1500, 1500, 1500)

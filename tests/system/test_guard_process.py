@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from faults.processes import Process
 from faults.record import aftermath
 from faults.stage import faulty_policy, staged
@@ -15,8 +13,6 @@ from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.guard.values import GuardSettings
 from sitl.clock import Clock
-
-pytestmark = pytest.mark.system
 
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")
 END_S = 15

@@ -19,8 +19,6 @@ from helpers.guides import ROOT, blocks, command_lines
 from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
 
-pytestmark = pytest.mark.system
-
 TIMEOUT_S = 90.0
 STARTS = 3
 IN_CONTROL = "the policy has control"

@@ -29,7 +29,6 @@ from policy.preprocess import image_to_input
 
 PYTHON = os.environ.get("MAVBRIDGE_LEROBOT_PYTHON", "")
 pytestmark = [
-    pytest.mark.system,
     pytest.mark.skipif(not PYTHON, reason="MAVBRIDGE_LEROBOT_PYTHON names no Python with LeRobot"),
 ]
 SERVER = Path(__file__).parents[2] / "examples" / "servers" / "lerobot_server.py"

@@ -39,8 +39,6 @@ from policy.loading.load import load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.protocol import PolicyRunner
 
-pytestmark = pytest.mark.system
-
 SMALL = Contract(arrays="numpy", image_height=32, image_width=32)
 CLOCK = MonotonicClock()
 PATIENT_S = 20.0

@@ -15,8 +15,6 @@ from mavbridge.core.processes import free_port, running
 from mavbridge.recording.flight_folder import open_flight
 from policy.data.flight_folders import leave_out_failed, read_flight
 
-pytestmark = pytest.mark.system
-
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--engage-channel", "7")
 PITCH_CHANNEL, FORWARD_US, SWITCH = 2, 1300, 7
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")

@@ -8,8 +8,6 @@ import pytest
 from faults.stage import staged
 from helpers.noted_policy import noted_calls, noted_policy
 
-pytestmark = pytest.mark.system
-
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm", "--policy")
 MAIN, VISION, ACTION = "MainThread", "mavbridge-vision", "mavbridge-policy"
 
