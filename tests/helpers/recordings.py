@@ -84,6 +84,8 @@ def make_meta(**changes: Any) -> FlightMeta:
 class InProcessWriter:
     """Replaces ``VideoWriter`` where its process is not under test: starting it takes a second."""
 
+    misfit = None
+
     def __init__(self, job: VideoJob, *, pressure: str) -> None:
         if job.tlog is not None:
             job.tlog.close()

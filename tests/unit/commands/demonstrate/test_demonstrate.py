@@ -83,6 +83,7 @@ def test_every_tick_and_frame_has_the_experts_word_and_the_truth(flight: Recorde
     assert images[0].std() > 0
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_the_seed_decides_all_of_it(tmp_path: Path) -> None:
     for name in "ab":
         assert demonstrate(config(tmp_path / name, max_time=2.0)) == 0
@@ -91,6 +92,7 @@ def test_the_seed_decides_all_of_it(tmp_path: Path) -> None:
     assert again.frames.equals(flight.frames)
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_finished_flight_is_kept_and_an_unfinished_one_is_flown_again(
     flight: RecordedFlight, tmp_path: Path
 ) -> None:
@@ -136,6 +138,7 @@ def test_a_flight_of_other_settings_is_neither_counted_nor_overwritten(
     assert (tmp_path / "000000/camera.mp4").is_file()
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_no_other_student_goes_on_where_no_files_tell_two_apart(
     flight: RecordedFlight, tmp_path: Path
 ) -> None:
@@ -179,6 +182,7 @@ def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
     assert replace(slow, delays=fast.delays) == fast, "all else is as without it"
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Path) -> None:
     slow = replace(
         config(tmp_path, max_time=2.0),
@@ -207,6 +211,7 @@ class Single:
 """
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_student_without_a_checkpoint_flies(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(STUDENT)
     spec = f"{tmp_path}/mine.py:Single"
@@ -229,6 +234,7 @@ def refuse_some():
 """
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_labels_are_of_the_rows_own_solves_if_the_student_refuses_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +254,7 @@ def test_labels_are_of_the_rows_own_solves_if_the_student_refuses_some(
     np.testing.assert_allclose(1e4 * column(flight, "expert")[:, 3], solved_ns / 1e9, atol=1e-3)
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_scripted_student_lives_in_simulated_time(tmp_path: Path) -> None:
     sent = []
     for name in ("a", "b"):
@@ -272,6 +279,7 @@ def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> N
         assert 0.55 < np.mean(one) < 0.95
 
 
+@pytest.mark.usefixtures("in_process_writer")
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_by_body_rates_races_are_demonstrated_and_read_back(
     tmp_path: Path, autopilot: AutopilotKind

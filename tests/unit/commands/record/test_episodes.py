@@ -75,6 +75,7 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
     assert stand.episodes.counts.total() == 2
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_an_episode_begins_when_its_writer_runs(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,6 +94,7 @@ def test_an_episode_begins_when_its_writer_runs(
     ]
 
 
+@pytest.mark.usefixtures("in_process_writer")
 @pytest.mark.parametrize(("mark", "success"), [("good", True), ("bad", False)])
 def test_a_mark_counts_before_and_after_the_end(stand: Stand, mark: str, success: bool) -> None:
     stand.episodes.begin()
@@ -107,6 +109,7 @@ def test_a_mark_counts_before_and_after_the_end(stand: Stand, mark: str, success
     assert stand.episodes.counts == {not success: 1}
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_crash_is_bad_by_itself_and_a_mark_has_the_last_word(stand: Stand) -> None:
     stand.record(0, texts=("vehicle: Crash: Disarming",))
     meta = stand.flight(1).meta
@@ -118,6 +121,7 @@ def test_a_crash_is_bad_by_itself_and_a_mark_has_the_last_word(stand: Stand) -> 
     assert stand.flight(1).meta.crash == meta.crash
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_an_episode_cannot_go_on_after_a_crash_or_without_recorder_or_images(stand: Stand) -> None:
     stand.episodes.begin()
     episode = stand.episodes.current
@@ -130,6 +134,7 @@ def test_an_episode_cannot_go_on_after_a_crash_or_without_recorder_or_images(sta
     assert episode.obstacle == "an error (the disk is full)"
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_later_session_goes_on_counting(stand: Stand) -> None:
     stand.record(0)
     again = Stand(stand.out)
@@ -138,6 +143,7 @@ def test_a_later_session_goes_on_counting(stand: Stand) -> None:
     assert stand.flight(2).meta.ticks == 3
 
 
+@pytest.mark.usefixtures("in_process_writer")
 def test_a_flight_is_no_folder_for_flights(stand: Stand) -> None:
     stand.record(0)
     with pytest.raises(UserError, match="is a flight itself"):
