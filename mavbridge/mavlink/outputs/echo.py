@@ -124,9 +124,9 @@ class EchoCheck:
         pause_ns = self._rules.longest_pause_ns
         return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
-    def is_held(self, now_ns: int) -> bool:
-        """True if the vehicle shows sticks of ours, perhaps because it hears us no more."""
-        return self._held_ours is not None and not self.is_unshown(now_ns)
+    def is_deaf(self, now_ns: int) -> bool:
+        """True if the vehicle shows sticks of ours since the release, and not the last ones."""
+        return not (self._held_ours is None or self.shows_last or self.is_unshown(now_ns))
 
     def with_dither(self, wanted: Shown, now_ns: int) -> Shown:
         """Return the values to send, one dithered by up to two steps, so that its echo changes."""

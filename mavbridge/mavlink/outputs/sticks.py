@@ -142,10 +142,10 @@ class OverrideOutput(StickOutput):
         vehicle.condition.is_released = self.echo.is_released and not self.echo.is_sending
 
     def must_release(self, sent: int, now_ns: int) -> bool:
-        """True for a while, and as long as sticks of ours are shown in place of a receiver's."""
-        is_held = self.echo.is_held(now_ns)
+        """True for a while, and as long as a vehicle with a receiver has not heard any."""
+        is_deaf = self.echo.is_deaf(now_ns)
         has_receiver = self._status is not None and self._status.has_receiver
-        return super().must_release(sent, now_ns) or bool(has_receiver and is_held)
+        return super().must_release(sent, now_ns) or bool(has_receiver and is_deaf)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
