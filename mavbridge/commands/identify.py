@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Sides = tuple[float, float]
 """Value for the positive side, value for the negative side."""
-_DEG, _NONE = math.degrees(1.0), 1e-9
-"""One radian; a motion that counts as none."""
+_NONE = 1e-9
+"""Motion that counts as none."""
 MAX_ROWS = 100_000
 """Most ticks kept: four minutes at 400 Hz. The oldest are dropped first."""
 STEP_S, LEAD = 0.01, 60
@@ -48,53 +48,41 @@ EARLY_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 1.0, 0.25, 20.0
 longest gap in sends of a flying policy; time to climb before the doublet."""
 STEADY, LEAST_EXPLAINED = 0.1, 0.5
 """Most change of a steady action, as a share of it; least share of a motion to be explained."""
-
-
-class Channel(NamedTuple):
-    """One axis: a number of the action, and the resulting motion in a 13-D state."""
-
-    axis: Axis
-    column: int
-    scale: float
-    """Factor from the number of the action to the motion's unit, or to shares of full stick."""
-    motion: str
-    """With its unit; + is right, forward, nose right, up."""
-    stamp: str
-    """Field of a ``VehicleState`` with the time of the motion."""
-    read: Callable[[FloatArray], float]
-
-
-_LEAN, _RATE = ("lean, deg", "attitude_ns"), ("rate, deg/s", "rate_ns")
-_SPEED = ("speed, m/s", "velocity_ns")
-_ROLL = (*_LEAN, lambda state: _DEG * measure(state).roll_rad)
-_PITCH = (*_LEAN, lambda state: -_DEG * measure(state).pitch_rad)
-_YAW = (*_RATE, lambda state: _DEG * measure(state).yaw_rate_radps)
-_CLIMB = (*_SPEED, lambda state: measure(state).climb_mps)
-CHANNELS: dict[ActionKind, tuple[Channel, ...]] = {
-    "sticks": (
-        Channel("roll", 3, 1.0, *_ROLL),
-        Channel("pitch", 2, 1.0, *_PITCH),
-        Channel("yaw", 1, 1.0, *_YAW),
-        Channel("climb", 0, 1.0, *_CLIMB),
-    ),
-    "attitude": (
-        Channel("roll", 1, _DEG, *_ROLL),
-        Channel("pitch", 2, -_DEG, *_PITCH),
-        Channel("yaw", 3, _DEG, *_YAW),
-    ),
-    "rates": (
-        Channel("roll", 1, _DEG, *_RATE, lambda state: _DEG * float(state[RATE][0])),
-        Channel("pitch", 2, -_DEG, *_RATE, lambda state: -_DEG * float(state[RATE][1])),
-        Channel("yaw", 3, _DEG, *_YAW),
-    ),
-    "velocity": (
-        Channel("roll", 1, 1.0, *_SPEED, lambda state: measure(state).right_mps),
-        Channel("pitch", 0, 1.0, *_SPEED, lambda state: measure(state).forward_mps),
-        Channel("yaw", 3, _DEG, *_YAW),
-        Channel("climb", 2, -1.0, *_CLIMB),
-    ),
+Quantity = Literal["lean", "rate", "speed"]
+UNITS: dict[Quantity, tuple[str, float, str]] = {
+    "lean": ("deg", math.degrees(1.0), "attitude_ns"),
+    "rate": ("deg/s", math.degrees(1.0), "rate_ns"),
+    "speed": ("m/s", 1.0, "velocity_ns"),
 }
-"""Axes pushed by the doublet of each kind of action."""
+"""Unit, factor to it, and the field of a state with the measurement time."""
+LEANS: dict[ActionKind, Quantity] = {
+    "sticks": "lean",
+    "attitude": "lean",
+    "rates": "rate",
+    "velocity": "speed",
+}
+"""Roll and pitch by each kind of action; yaw is a rate, climb a speed."""
+
+
+def measured_motion(state: FloatArray) -> dict[Quantity, dict[Axis, float]]:
+    """Return the motion in a 13-D state, in rad and m/s: + is right, forward, nose right, up."""
+    motion, (roll, pitch, yaw) = measure(state), state[RATE].tolist()
+    return {
+        "lean": {"roll": motion.roll_rad, "pitch": -motion.pitch_rad},
+        "rate": {"roll": roll, "pitch": -pitch, "yaw": yaw},
+        "speed": {"roll": motion.right_mps, "pitch": motion.forward_mps, "climb": motion.climb_mps},
+    }
+
+
+def trained_motion(contract: Contract, action: Action) -> dict[Axis, float]:
+    """Return the motion that a policy expects of an action, as ``measured_motion`` does."""
+    first, second, third, yaw = action
+    if contract.action == "sticks":
+        climb, yaw, pitch, roll = motion_of_sticks(contract, *action)
+        return {"roll": roll, "pitch": pitch, "yaw": yaw, "climb": climb}
+    if contract.action == "velocity":
+        return {"roll": second, "pitch": first, "yaw": yaw, "climb": -third}
+    return {"roll": second, "pitch": -third, "yaw": yaw}
 
 
 class ResponseRecording:
@@ -109,15 +97,16 @@ class ResponseRecording:
             # The policy's action after its limits, before any mapping to this vehicle's curves.
             self._rows.append((event.sent_ns, event.trace.smoothed, event.state))
 
-    def inputs(self, column: int) -> tuple[Array, Array]:
-        """Return times in s and values of one number of the actions."""
+    def inputs(self, read: Callable[[Action], float]) -> tuple[Array, Array]:
+        """Return times in s and values of something read from the actions."""
         times = np.array([at_ns for at_ns, _, _ in self._rows], np.float64) / NS_PER_S
-        return times, np.array([action[column] for _, action, _ in self._rows], np.float64)
+        return times, np.array([read(action) for _, action, _ in self._rows], np.float64)
 
-    def outputs(self, channel: Channel) -> tuple[Array, Array]:
+    def outputs(self, axis: Axis, quantity: Quantity) -> tuple[Array, Array]:
         """Return times in s and values of a motion, without repeated times."""
-        states = {getattr(state, channel.stamp): state.values for _, _, state in self._rows}
-        values = [channel.read(states[at_ns]) for at_ns in sorted(states)]
+        stamp = UNITS[quantity][2]
+        states = {getattr(state, stamp): state.values for _, _, state in self._rows}
+        values = [measured_motion(states[at_ns])[quantity][axis] for at_ns in sorted(states)]
         return np.array(sorted(states), np.float64) / NS_PER_S, np.array(values)
 
 
@@ -128,12 +117,10 @@ class PushResult:
     axis: Axis
     motion: str
     """With its unit."""
-    action: Sides
-    """In shares of full stick, or in the unit of the motion."""
+    trained: Sides
+    """Motion that the policy's training expects of the actions."""
     measured: Sides
     """Settled motion of the vehicle."""
-    trained: Sides
-    """Motion expected by the policy's training."""
     ratio: Sides
     """Measured over trained."""
     dead_time_s: float
@@ -157,13 +144,10 @@ def identify_pushes(
     """Fit every push of the flown doublet, which began at ``program_start_s`` on the clock of the
     stamps; ``contract`` is of the policy to compare with."""
     steps = doublet_steps(contract.action, program_start_s)
-    found = {
-        step.axis: _fit_push(recording, channel, step, contract)
-        for step, channel in zip(steps, CHANNELS[contract.action], strict=True)
-    }
+    found = {step.axis: _fit_push(recording, step, contract) for step in steps}
     hover = None
     if contract.action in ("rates", "attitude"):
-        at_s, thrust = recording.inputs(0)
+        at_s, thrust = recording.inputs(lambda action: action[0])
         ends_s = [step.end_s + step.settle_s for step in steps]
         still = [(at_s >= end_s - STILL_S) & (at_s < end_s) for end_s in ends_s]
         rested = thrust[np.any(still, axis=0)]
@@ -176,57 +160,47 @@ def identify_pushes(
 
 
 def _fit_push(
-    recording: ResponseRecording, channel: Channel, step: DoubletStep, contract: Contract
+    recording: ResponseRecording, step: DoubletStep, contract: Contract
 ) -> PushResult | str:
     """Return the result of one push, or the reason why there is none; ``step`` is on the clock of
     the stamps."""
-    input_s, inputs = recording.inputs(channel.column)
+    axis = step.axis
+    quantity: Quantity = "rate" if axis == "yaw" else "speed"
+    if axis in ("roll", "pitch"):
+        quantity = LEANS[contract.action]
+    unit, scale, _ = UNITS[quantity]
+    input_s, inputs = recording.inputs(lambda action: trained_motion(contract, action)[axis])
     flown_s = input_s[(input_s >= step.begin_s) & (input_s <= step.end_s)]
     if np.diff(np.concatenate([[step.begin_s], flown_s, [step.end_s]])).max() > LONGEST_GAP_S:
         return "the policy did not fly all of it"
     grid_s = np.arange(step.begin_s - LEAD * STEP_S, step.end_s - EARLY_S, STEP_S)
     at_s, latest = grid_s[LEAD:], np.searchsorted(input_s, grid_s, side="right") - 1
-    held = channel.scale * inputs[np.maximum(latest, 0)]
-    moved = np.interp(at_s, *recording.outputs(channel))
-    action = float(held[LEAD:].max()), float(held[LEAD:].min())
-    up, down = (_trained_motion(contract, channel, amount) for amount in action)
-    if up <= 0.0 or down >= 0.0:
+    held = scale * inputs[np.maximum(latest, 0)]
+    pushed = held[LEAD:]
+    moved = scale * np.interp(at_s, *recording.outputs(axis, quantity))
+    if not pushed.min() < 0.0 < pushed.max():
         return "it was not pushed to both sides"
     left_s = (step.end_s - EARLY_S - at_s) % (step.half_s + step.rest_s)
     late = left_s < step.half_s / 4  # the end of each of the two pushes
-    size = np.abs(held[LEAD:][late])
+    size = np.abs(pushed[late])
     settled = late if np.ptp(size) <= STEADY * size.mean() else np.full(len(at_s), True)
-    gains, dead_time_s, lag_s, explained = _fit_response(held, moved, settled)
+    ratio, dead_time_s, lag_s, explained = _fit_response(held, moved, settled)
     if explained < LEAST_EXPLAINED:
         return "the motion does not follow the action"
-    measured = gains[0] * action[0], gains[1] * action[1]
+    trained = float(pushed.max()), float(pushed.min())
     return PushResult(
-        axis=step.axis,
-        motion=channel.motion,
-        action=action,
-        measured=measured,
-        trained=(up, down),
-        ratio=(measured[0] / up, measured[1] / down),
+        axis=axis,
+        motion=f"{quantity}, {unit}",
+        trained=trained,
+        measured=(ratio[0] * trained[0], ratio[1] * trained[1]),
+        ratio=ratio,
         dead_time_s=dead_time_s,
         time_63_s=dead_time_s + lag_s,
     )
 
 
-def _trained_motion(contract: Contract, channel: Channel, amount: float) -> float:
-    """Return the motion that a policy expects of an action held at ``amount``.
-
-    ``amount`` is in shares of full stick if the actions are sticks, else the commanded motion.
-    """
-    if contract.action != "sticks":
-        return amount
-    sticks = [0.0] * 4
-    sticks[channel.column] = amount
-    motion = motion_of_sticks(contract, *sticks)[channel.column]
-    return motion if channel.axis == "climb" else math.degrees(motion)
-
-
 def _fit_response(held: Array, moved: Array, settled: Mask) -> tuple[Sides, float, float, float]:
-    """Fit ``moved = gain * lag(held, dead time earlier)``, with a gain for each sign.
+    """Fit ``moved = gain * lag(held, dead time earlier)``, with a gain for each sign of ``held``.
 
     Return the gains, dead time and lag in s, and the share of the motion that they explain. Gains
     are those of the samples ``settled``: all would give 10 % less for a full yaw rate, 14 % for a
@@ -250,22 +224,20 @@ def _fit_response(held: Array, moved: Array, settled: Mask) -> tuple[Sides, floa
 
 def print_identification(found: Identification, contract: Contract, console: Console) -> None:
     """Print every push, the policy's hover thrust, and the missing results."""
-    is_sticks = contract.action == "sticks"
-    header = ["axis", "action", "motion", "measured", "trained", "ratio", "dead time", "63 %"]
+    header = ["axis", "motion", "trained", "measured", "ratio", "dead time", "63 %"]
     rows = [
         [
             push.axis,
-            f"{push.action[0]:.0%}" if is_sticks else f"{push.action[0]:.2f}",
             push.motion,
-            "{:+.2f} {:+.2f}".format(*push.measured),
             "{:+.2f} {:+.2f}".format(*push.trained),
+            "{:+.2f} {:+.2f}".format(*push.measured),
             "{:.2f} {:.2f}".format(*push.ratio),
             f"{1e3 * push.dead_time_s:.0f} ms",
             f"{1e3 * push.time_63_s:.0f} ms",
         ]
         for push in found.pushes
     ]
-    console.print(make_table("what the vehicle does", header, rows, left_columns=3))
+    console.print(make_table("what the vehicle does", header, rows, left_columns=2))
     if (hover := found.policy_hover_thrust) is not None:
         told = f"hovers at a policy's thrust of {hover:.3f}, which is scaled for the vehicle;"
         console.print(f"{told} trained with {contract.hover_thrust:.3f}")

@@ -15,7 +15,6 @@ from helpers.factories import make_released_tick, make_state, make_tick, make_tr
 from helpers.fakes import FakeClock
 from mavbridge.commands.config import IdentifyConfig
 from mavbridge.commands.identify import (
-    CHANNELS,
     Identification,
     ResponseRecording,
     doublet_flight,
@@ -38,8 +37,17 @@ STEP_S = 0.01
 LAG_S, DEAD_STEPS = 0.15, 8
 MARGIN_S = 1.0
 
+DEG = math.degrees(1.0)
+TURNS = {"roll": (1, DEG), "pitch": (2, -DEG), "yaw": (3, DEG)}
+ACTIONS: dict[ActionKind, dict[str, tuple[int, float]]] = {
+    "sticks": {"roll": (3, 1.0), "pitch": (2, 1.0), "yaw": (1, 1.0), "climb": (0, 1.0)},
+    "attitude": TURNS,
+    "rates": TURNS,
+    "velocity": {"roll": (1, 1.0), "pitch": (0, 1.0), "yaw": (3, DEG), "climb": (2, -1.0)},
+}
+"""Number of an action that moves each axis, and the factor from it to the unit of a curve."""
 Curve = Callable[[str, float], float]
-"""(axis, action in the unit of its channel) -> motion in the unit of its signal."""
+"""(axis, share of full stick, or motion in deg and m/s) -> motion in deg and m/s."""
 
 
 def usual_sticks(axis: str, stick: float) -> float:
@@ -62,9 +70,8 @@ def recorded(
     random = np.random.default_rng(0)
     recording = ResponseRecording()
     amounts = {"sticks": 1.0, "attitude": 20.0, "rates": 40.0, "velocity": 2.0}
-    channels = {channel.axis: channel for channel in CHANNELS[kind]}
-    motions = dict.fromkeys(channels, 0.0)
-    waiting: dict[str, list[float]] = {axis: [0.0] * DEAD_STEPS for axis in channels}
+    motions = dict.fromkeys(ACTIONS[kind], 0.0)
+    waiting: dict[str, list[float]] = {axis: [0.0] * DEAD_STEPS for axis in motions}
     for index in range(round((doublet_length_s(kind) + 2 * MARGIN_S) / STEP_S)):
         time_s = index * STEP_S - MARGIN_S
         at_ns = round((START_S + time_s) * NS_PER_S)
@@ -75,9 +82,9 @@ def recorded(
         action = [0.0] * 4
         if kind in ("attitude", "rates"):
             action[0] = hover
-        for axis, channel in channels.items():
+        for axis, (column, scale) in ACTIONS[kind].items():
             amount = sum(push.share for push in pushes if push.axis == axis) * amounts[kind]
-            action[channel.column] = amount / channel.scale
+            action[column] = amount / scale
             waiting[axis].append(amount)
             wanted = curve(axis, waiting[axis].pop(0))
             motions[axis] += (wanted - motions[axis]) / lag_s * STEP_S
