@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import av
 import numpy as np
@@ -44,16 +44,23 @@ Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | Non
 _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 
 
-def vector_stats(values: NDArray[np.generic]) -> Stats:
-    """Return statistics of each column of values [N, D] or [N], N >= 1."""
+def vector_stats(values: NDArray[np.generic], counts: NDArray[np.int64] | None = None) -> Stats:
+    """Return statistics of each column of values [N, D] or [N], N >= 1; with ``counts`` [N, D],
+    each value stands for so many."""
     numbers = values.reshape(len(values), -1).astype(np.float64)
+    counted = numbers if counts is None else np.where(counts > 0, numbers, np.nan)
+    mean = np.average(numbers, axis=0, weights=counts)
+    method: Literal["linear", "inverted_cdf"] = "linear" if counts is None else "inverted_cdf"
     return {
-        "min": numbers.min(axis=0),
-        "max": numbers.max(axis=0),
-        "mean": numbers.mean(axis=0),
-        "std": numbers.std(axis=0),
+        "min": np.nanmin(counted, axis=0),
+        "max": np.nanmax(counted, axis=0),
+        "mean": mean,
+        "std": np.sqrt(np.average((numbers - mean) ** 2, axis=0, weights=counts)),
         "count": np.array([len(numbers)], np.int64),
-        **{name: np.quantile(numbers, at, axis=0) for name, at in QUANTILES.items()},
+        **{
+            name: np.quantile(numbers, at, axis=0, weights=counts, method=method)
+            for name, at in QUANTILES.items()
+        },
     }
 
 
@@ -65,23 +72,9 @@ def colour_counts(rgb: ImageArray) -> NDArray[np.int64]:
 
 def colour_stats(counts: NDArray[np.int64], images: int) -> Stats:
     """Return statistics [3, 1, 1] of colours in [0, 1]; "count" is the number of images."""
-    levels = np.arange(_LEVELS) / (_LEVELS - 1)
-    total = counts.sum(axis=1)
-    mean = counts @ levels / total
-    variance = counts @ levels**2 / total - mean**2
-    up_to = np.cumsum(counts, axis=1)
-    found: dict[str, NDArray[np.float64]] = {
-        "min": levels[(counts > 0).argmax(axis=1)],
-        "max": levels[_LEVELS - 1 - (counts[:, ::-1] > 0).argmax(axis=1)],
-        "mean": mean,
-        "std": np.sqrt(np.maximum(variance, 0.0)),
-        **{
-            name: levels[(up_to >= at * total[:, None]).argmax(axis=1)]
-            for name, at in QUANTILES.items()
-        },
-    }
-    out: Stats = {name: values.reshape(3, 1, 1) for name, values in found.items()}
-    return out | {"count": np.array([images], np.int64)}
+    levels = np.tile(np.arange(_LEVELS)[:, None] / (_LEVELS - 1), 3)
+    found = {name: each.reshape(-1, 1, 1) for name, each in vector_stats(levels, counts.T).items()}
+    return found | {"count": np.array([images], np.int64)}
 
 
 FILES_A_CHUNK = 1000
