@@ -22,8 +22,6 @@ from mavbridge.mavlink.profiles.ardupilot_sticks import (
     takeoff_notes,
 )
 from mavbridge.mavlink.profiles.profile import (
-    LONGEST_S,
-    SHORTEST_S,
     ModeTable,
     ParamContext,
     ParamNote,
@@ -215,14 +213,12 @@ def _override_notes(
 def _timeout_notes(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Yield what ends overrides too early, too late or never."""
     name, time_s = "RC_OVERRIDE_TIME", values.get("RC_OVERRIDE_TIME", 1.0)
-    yield ParamNote("wanted", (name,), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
     if time_s == 0:
         yield ParamNote.of("obstacle", name, time_s, ", which disables overrides", 0.5)
     if time_s < 0:
         why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
         yield ParamNote.of_risk("endless-override", why, name, f"--set {name}=0.5")
-    if time_s > 0:
-        yield from timeout_notes(values, name, "hold its last sticks")
+    yield from timeout_notes(values, name, "hold its last sticks")
     if context.has_receiver is False:  # overrides that have ended are then kept until the failsafe
         yield from timeout_notes(values, "RC_FS_TIMEOUT", "hold its last sticks")
     failsafe = "not 0" if context.has_receiver else "not 0, without a receiver"
@@ -251,7 +247,6 @@ def _setpoint_notes(values: Mapping[str, float], context: ParamContext) -> Itera
         effect = ", with which it takes our thrust for a climb rate"
         mended = int(options) | _THRUST_AS_THRUST
         yield ParamNote.of("obstacle", "GUID_OPTIONS", options, effect, mended)
-    yield ParamNote("wanted", ("GUID_TIMEOUT",), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
     yield from timeout_notes(values, "GUID_TIMEOUT", "hold its last setpoint", is_setpoint=True)
     yield ParamNote("wanted", ("FS_THR_ENABLE",), "not 0" if context.has_receiver else "0")
     failsafe = values.get("FS_THR_ENABLE", 0.0)

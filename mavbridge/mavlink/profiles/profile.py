@@ -164,8 +164,9 @@ _LONGEST_SETPOINT_S = 3.0
 def timeout_notes(
     values: Mapping[str, float], name: str, does: str, *, is_setpoint: bool = False
 ) -> Iterator[ParamNote]:
-    """Yield a note if the vehicle would go on for too long after the death of the guard, or would
-    not wait for packets that are late."""
+    """Yield the wanted time, and a note if the vehicle would go on for too long after the death of
+    the guard, or would not wait for packets that are late."""
+    yield ParamNote("wanted", (name,), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
     time_s = values.get(name, LONGEST_S)
     if is_setpoint and time_s > _LONGEST_SETPOINT_S:
         why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)

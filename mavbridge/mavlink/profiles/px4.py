@@ -14,8 +14,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.vehicle import ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.profile import (
-    LONGEST_S,
-    SHORTEST_S,
     EventMeaning,
     ModeTable,
     ParamContext,
@@ -346,10 +344,9 @@ def _end_notes(
 ) -> Iterator[ParamNote]:
     """Yield unexpected effects of the end of our packets, by two parameters."""
     does, is_setpoint = "go on with the last it was told", time == "COM_OF_LOSS_T"
-    yield ParamNote("wanted", (time,), f"0.5; {SHORTEST_S:g} to {LONGEST_S:g} s")
+    yield from timeout_notes(values, time, does, is_setpoint=is_setpoint)
     end = "4 or 5 (land, hold)" if is_setpoint else "1, 2 or 3 (hold, return, land)"
     yield ParamNote("wanted", (action,), end)
-    yield from timeout_notes(values, time, does, is_setpoint=is_setpoint)
     if (value := values.get(action, 0.0)) in fatal:
         effect = f": it would {fatal[int(value)]} if our packets stopped"
         yield ParamNote.of("advice", action, value, effect)

@@ -167,8 +167,8 @@ class VehicleParams:
         self._follow_up: CommandRequest | None = None
         self._follow_ups_left = self._follow_up_ns = 0
         """Number of times still to send this command, and the time of the next."""
-        self._advised: ParamContext | None = None
-        """Context of the last advice to the user."""
+        self._advised: Assessment | None = None
+        """What the user was last advised about."""
         self._assessed: Assessment | None = None
         self.is_read = False
         """True if every parameter has arrived or was given up."""
@@ -305,12 +305,14 @@ class VehicleParams:
             self.calibration = now
 
     def _advise(self, status: VehicleStatus | None) -> None:
-        assessment = self._current(status)
-        context, is_piloted = assessment.context, self._config.pilot_hz is not None
-        has_output = context.output is not None
-        if not has_output or context == self._advised or not self.changes.is_settled:
+        before, is_armed = self._advised, status is not None and status.armed
+        assessment, is_piloted = self._current(status), self._config.pilot_hz is not None
+        is_same = before is not None and assessment.context == before.context
+        # On the ground, values also change by --set, and back.
+        is_known = assessment is before or (is_same and not is_armed)
+        if assessment.context.output is None or is_known or not self.changes.is_settled:
             return
-        self._advised = context
+        self._advised = assessment
         for note in assessment.notes:
             if note.turns_sticks if is_piloted else note.kind == "advice":
                 self._report(AdviceText(note.text))

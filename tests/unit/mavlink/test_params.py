@@ -99,6 +99,19 @@ def test_a_recording_is_told_what_turns_the_pilots_sticks(change: dict[str, floa
     assert text.startswith(f"{next(iter(change))} is ")
 
 
+@pytest.mark.parametrize("is_armed", [True, False])
+def test_a_change_by_another_station_is_advised_of_once_armed(is_armed: bool) -> None:
+    vehicle = after_reading(ParamVehicle({"GUID_TIMEOUT": 0.5}, output="velocity"))
+    vehicle.armed = is_armed
+    vehicle.set_by_pilot("GUID_TIMEOUT", 2.0)
+    vehicle.run(1.0)
+    assert vehicle.params.interruption is None
+    assert ["GUID_TIMEOUT is 2" in text for text in vehicle.texts] == [True] * is_armed
+    vehicle.armed = True
+    vehicle.run(1.0)
+    assert ["GUID_TIMEOUT is 2" in text for text in vehicle.texts] == [True]
+
+
 def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:
     vehicle = after_reading(ParamVehicle({"GUID_TIMEOUT": 3.0}, output="velocity"))
     assert len(vehicle.texts) == 1
