@@ -172,7 +172,7 @@ def _parser() -> argparse.ArgumentParser:
     keeps: dict[str, Any] = {"allow_abbrev": False, "argument_default": argparse.SUPPRESS}
     add = parser.add_argument
     connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
-    add("--connect", action="append", metavar="LINK", help=connect_help)
+    add("--connect", "--connect-onboard", action="append", metavar="LINK", help=connect_help)
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
     add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")

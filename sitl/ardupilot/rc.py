@@ -66,6 +66,15 @@ class RcEngine:
                 self._override_ns[index] = now_ns
                 self._fresh_override = self._was_overridden = True
 
+    def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
+        """Override the sticks by a joystick: -1000..1000, z 0..1000; +x is forward, a lower PWM."""
+        raw_us = [IGNORE] * OVERRIDDEN_CHANNELS
+        for axis, share in zip(STICKS, (y + 1000, 1000 - x, 2 * z, r + 1000), strict=True):
+            index = self.index_of(axis)
+            low, high = (self._params.integer(f"RC{index + 1}_{end}") for end in ("MIN", "MAX"))
+            raw_us[index] = low + (high - low) * share // 2000
+        self.override(raw_us, now_ns)
+
     def index_of(self, axis: str) -> int:
         """Return the zero-based channel of one of ``STICKS``, by RCMAP_* at boot."""
         return self._indices[axis]

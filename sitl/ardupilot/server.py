@@ -84,6 +84,13 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             self._log.releases += 1
         self._ap.rc.override(raw_us, self._arrived_ns)
 
+    def on_manual_control(self, _link: ArduPilotEndpoint, message: Message) -> None:
+        if message.target != self._ap.system_id or not self._is_from_gcs(message):
+            return
+        self._log.manual_controls += 1
+        sticks = {name: getattr(message, name) for name in "xyzr"}
+        self._ap.rc.manual_control(**sticks, now_ns=self._arrived_ns)
+
     def on_set_attitude_target(self, _link: ArduPilotEndpoint, message: Message) -> None:
         ap = self._ap
         if ap.guided is None:
@@ -116,6 +123,12 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         except ValueError:
             return FAILED
         return ACCEPTED if self._ap.set_mode(mode) else FAILED
+
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return ACCEPTED if self._ap.set_mode(Mode.RTL) else FAILED
+
+    def cmd_nav_land(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return ACCEPTED if self._ap.set_mode(Mode.LAND) else FAILED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if params[0] not in (0.0, 1.0):

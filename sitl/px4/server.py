@@ -110,6 +110,12 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             self._ap.prepare_takeoff(None)
         return ACCEPTED if self._ap.set_mode(mode) else REJECTED
 
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_RTL) else REJECTED
+
+    def cmd_nav_land(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_LAND) else REJECTED
+
     def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int:
         is_forced = params[1] == FORCE
         done = self._ap.arm() if params[0] == 1.0 else self._ap.disarm(force=is_forced)

@@ -105,3 +105,21 @@ def test_the_report_counts_the_setpoints_that_were_followed(station):
             station.run(0.02)
     vehicle = station.vehicle
     assert vehicle.log.summary(vehicle.ap)["setpoints"] == 5
+
+
+@pytest.mark.parametrize(
+    ("number", "mode"),
+    [(mav.MAV_CMD_NAV_LAND, Mode.LAND), (mav.MAV_CMD_NAV_RETURN_TO_LAUNCH, Mode.RTL)],
+)
+def test_a_station_lands_it_and_calls_it_home(station, number, mode):
+    station.run(6.0)
+    station.command(number)
+    station.run(0.1)
+    assert station.vehicle.ap.mode is mode
+
+
+def test_a_station_joystick_overrides_the_sticks(station):
+    station.send(mav.MAVLink_manual_control_message(1, 1000, -1000, 250, 0, 0))
+    station.run(0.1)
+    assert list(station.vehicle.ap.rc.channels_us[:4]) == [1000, 1000, 1250, 1500]
+    assert station.vehicle.log.manual_controls == 1
