@@ -44,7 +44,6 @@ def sent_ms(seed=0, seconds=1, interval_us=10_000, **conditions):
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
     link, parser, sent = vehicle.server.links[0], mav.MAVLink(None), []
     assert link.set_interval(ATTITUDE, interval_us)
-    assert link.interval_us(ATTITUDE) == interval_us, "without the delays"
     for now_ns in range(STEP_NS, seconds * NS_PER_S, STEP_NS):
         vehicle.step(now_ns)
         messages = parser.parse_buffer(vehicle.take_outgoing(0)) or ()
