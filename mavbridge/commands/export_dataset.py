@@ -45,8 +45,8 @@ _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 
 
 def vector_stats(values: NDArray[np.generic], counts: NDArray[np.int64] | None = None) -> Stats:
-    """Return statistics of each column of values [N, D] or [N], N >= 1; with ``counts`` [N, D],
-    each value stands for so many."""
+    """Return statistics of each column of values [N, D] or [N], N >= 1; ``counts`` [N, D] says how
+    often each value occurs."""
     numbers = values.reshape(len(values), -1).astype(np.float64)
     counted = numbers if counts is None else np.where(counts > 0, numbers, np.nan)
     mean = np.average(numbers, axis=0, weights=counts)

@@ -144,12 +144,10 @@ class Code(StrEnum):
     NO_ECHO = _vehicle("no {message} arrives, so our {quantity} cannot be checked")
     LATE_SENDING = _vehicle("our packets take {age_ms:.0f} ms or more to reach the vehicle")
     READING_PARAMETERS = _waiting(
-        "reading the vehicle's parameters: if this lasts, it does not hear us; check the way to it "
-        "(port, baud rate, signing)"
+        "reading the vehicle's parameters: if this lasts, check port, baud rate and signing"
     )
     REQUESTING_TELEMETRY = _waiting(
-        "requesting telemetry from the vehicle: if this lasts, its answers (COMMAND_ACK) do not "
-        "arrive; check what forwards the link"
+        "requesting telemetry from the vehicle: if this lasts, check what forwards its answers"
     )
     LOOKING_FOR_RECEIVER = _waiting("looking for the pilot's radio receiver")
     SETTING_PARAMETERS = _waiting("setting the vehicle's parameters")
@@ -189,9 +187,7 @@ class Code(StrEnum):
         "use --connect with a serial port of {enough:.0f} baud or more on both sides or with a "
         "network link, or a lower rates.action"
     )
-    OVERRIDE_SWITCH_NOT_ON = _waiting(
-        "the override switch (RC{channel}) is off: switch it on to fly"
-    )
+    OVERRIDE_SWITCH_NOT_ON = _waiting("override switch (RC{channel}) off: switch it on to fly")
     WITH_HINT = _vehicle("{first}; {hint}")
     SLOW_CLOCK = _vehicle(
         "the vehicle's clock runs at {pace:.2g} of real time: the simulator is slow, not the link; "
@@ -252,9 +248,7 @@ class Code(StrEnum):
     WRONG_SHAPE = _fault(
         "the policy returned {shape} instead of [1, {most}, 4], by its contract's horizon"
     )
-    UNUSABLE_CHUNKS = _fault(
-        "the policy returned {chunks} unusable chunks within a short time: {why}"
-    )
+    UNUSABLE_CHUNKS = _fault("the policy returned {chunks} unusable chunks in a short time: {why}")
     POLICY_REFUSED = _fault("{said}")
     NO_READING = _waiting("no {quantity} from the vehicle yet")
     NO_TRUSTED_READING = _waiting("no {quantity} from the vehicle yet, or none that it trusts")
