@@ -149,7 +149,8 @@ def first_that_agrees(
     except NoChunkError as error:
         note = f"engine torch: it has no chunk for a sample, which a graph cannot say: {error}"
         return make_torch_runner(policy, settings), (note,)
-    return make_torch_runner(policy, settings) if runner is reference else runner, notes
+    is_elsewhere = runner is reference and settings.device != "cpu"
+    return make_torch_runner(policy, settings) if is_elsewhere else runner, notes
 
 
 def first_with_chunks(

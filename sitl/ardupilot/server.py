@@ -122,13 +122,16 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             mode = Mode(int(params[1]))
         except ValueError:
             return FAILED
-        return ACCEPTED if self._ap.set_mode(mode) else FAILED
+        return self._to_mode(mode)
 
     def cmd_nav_return_to_launch(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
-        return ACCEPTED if self._ap.set_mode(Mode.RTL) else FAILED
+        return self._to_mode(Mode.RTL)
 
     def cmd_nav_land(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
-        return ACCEPTED if self._ap.set_mode(Mode.LAND) else FAILED
+        return self._to_mode(Mode.LAND)
+
+    def _to_mode(self, mode: Mode) -> int:
+        return ACCEPTED if self._ap.set_mode(mode) else FAILED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if params[0] not in (0.0, 1.0):

@@ -108,13 +108,16 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             return REJECTED
         if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
-        return ACCEPTED if self._ap.set_mode(mode) else REJECTED
+        return self._to_mode(mode)
 
     def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
-        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_RTL) else REJECTED
+        return self._to_mode(Px4Mode.AUTO_RTL)
 
     def cmd_nav_land(self, _params: Params7, _link: Px4Endpoint) -> int:
-        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_LAND) else REJECTED
+        return self._to_mode(Px4Mode.AUTO_LAND)
+
+    def _to_mode(self, mode: Px4Mode) -> int:
+        return ACCEPTED if self._ap.set_mode(mode) else REJECTED
 
     def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int:
         is_forced = params[1] == FORCE
@@ -125,7 +128,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         """Take off to param 7, an altitude above sea level; NaN: climb by MIS_TAKEOFF_ALT."""
         height_m = params[6] - Px4Telemetry.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
-        return ACCEPTED if self._ap.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
+        return self._to_mode(Px4Mode.AUTO_TAKEOFF)
 
     def cmd_preflight_reboot_shutdown(self, params: Params7, _link: Px4Endpoint) -> int:
         """Accept 0, a no-op. PX4 refuses a reboot while armed, and always in SITL."""
