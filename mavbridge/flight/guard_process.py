@@ -27,7 +27,7 @@ from mavbridge.guard.wire import (
     LastWords,
     ToGuard,
     decode_from_guard,
-    encode_to_guard,
+    encode,
 )
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 
@@ -100,7 +100,7 @@ class GuardProcess:
     def send(self, message: ToGuard) -> bool:
         """Send a message without waiting; return False if it was dropped."""
         with self._lock:
-            return self._port.send(encode_to_guard(message))
+            return self._port.send(encode(message))
 
     def wait_until_open(self, timeout_s: float = OPEN_S) -> None:
         """Wait for the guard's first message, sent when the link is open. Call before ``listen``.

@@ -26,7 +26,7 @@ from mavbridge.guard.wire import (
     LastWords,
     Packets,
     Samples,
-    decode_samples,
+    decode_from_guard,
 )
 
 _log = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ class TelemetryCache:
         try:
             while True:
                 for data in port.receive():
-                    self._receive_samples(decode_samples(data))
+                    self.receive(decode_from_guard(data))
                 if self.telemetry.attitude_ns > newer_than_ns:
                     return True
                 if (left_ns := until_ns - clock.now_ns()) <= 0:
@@ -174,7 +174,7 @@ class TelemetryCache:
         with self._lock:
             if self._samples is not None and not self._is_awaited:
                 for data in self._samples.receive():  # a slow policy leaves them to us
-                    self._receive_samples(decode_samples(data))
+                    self.receive(decode_from_guard(data))
         self.phase, self.reason = Phase(tick.phase), tick.release_reason
         self.starting_ns = tick.starting_ns
         joined = self._join(tick)

@@ -23,7 +23,7 @@ from mavbridge.guard.wire import (
     GuardDiedError,
     GuardSummary,
     decode_to_guard,
-    encode_from_guard,
+    encode,
 )
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
@@ -56,11 +56,11 @@ def main() -> None:
             _run(settings, port, samples, later, stack)
     except MavbridgeError as error:
         kind = UserError if isinstance(error, UserError) else PeerError
-        port.finish(encode_from_guard(kind(str(error))), LAST_WORDS_S)
+        port.finish(encode(kind(str(error))), LAST_WORDS_S)
         sys.exit(1)
     except Exception:  # noqa: BLE001 - the flight process shows it
         failed = f"the guard process has failed, a bug of mavbridge:\n{traceback.format_exc()}"
-        port.finish(encode_from_guard(GuardDiedError(failed)), LAST_WORDS_S)
+        port.finish(encode(GuardDiedError(failed)), LAST_WORDS_S)
         sys.exit(2)
 
 
@@ -92,7 +92,7 @@ def _run(
     # After the link is open: the first message tells the flight process so.
     for text in (problem, settle_guard(realtime=settings.realtime)):
         if text is not None:
-            port.send(encode_from_guard(text))
+            port.send(encode(text))
     try:
         loop.run(port)
     except BaseException:
@@ -107,7 +107,7 @@ def _run(
         dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,
     )
-    port.finish(encode_from_guard(summary), LAST_WORDS_S)
+    port.finish(encode(summary), LAST_WORDS_S)
 
 
 if __name__ == "__main__":

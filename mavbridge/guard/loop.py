@@ -30,9 +30,9 @@ from mavbridge.guard.wire import (
     GuardStatus,
     LastWords,
     Packets,
+    Samples,
     decode_to_guard,
-    encode_from_guard,
-    encode_samples,
+    encode,
 )
 from mavbridge.mavlink.link import MavlinkLink
 
@@ -132,7 +132,7 @@ class GuardLoop:
                 self._link.transmit(packet)
             left = tuple((at_ns - after_ns, later) for at_ns, later in packets[sent:])
             with suppress(Exception):
-                self._flight.send(encode_from_guard(self._words._replace(packets=left)))
+                self._flight.send(encode(self._words._replace(packets=left)))
 
     def _renew_words(self, snapshot: LinkSnapshot, tick: GuardTick) -> None:
         """Prepare the last words when their inputs have changed, and periodically."""
@@ -161,7 +161,7 @@ class GuardLoop:
         is_new = bool(packets) and outlet != self._words_outlet
         words = LastWords(self.guard.engagement.phase, mode, outlet.receiver, is_new, packets)
         self._words = words._replace(brings_file=False)
-        is_told = self._flight.send(encode_from_guard(words), outlet.fd if is_new else None)
+        is_told = self._flight.send(encode(words), outlet.fd if is_new else None)
         self._words_outlet = outlet if is_told and packets else None
 
     def run(self, woken_by: SocketPort) -> None:
@@ -249,7 +249,7 @@ class GuardLoop:
             sent=sent,
         )
         self._reports += 1
-        self._flight.send(encode_from_guard(told))
+        self._flight.send(encode(told))
 
     def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
         """Call ``send``. An error becomes a fault of the flight instead of ending the guard."""
@@ -274,7 +274,7 @@ class GuardLoop:
         if actions.takeoff_m is not None:
             self._attempt(partial(commands.takeoff, actions.takeoff_m))
         for text in output.messages:
-            self._flight.send(encode_from_guard(text))
+            self._flight.send(encode(text))
 
     def _finish(self, now_ns: int) -> None:
         """For at most FINISH_NS, restore parameters and send an outstanding release."""
@@ -290,15 +290,15 @@ class GuardLoop:
                 f"{FINISH_NS / NS_PER_S:g} s: set the old values, which the log has, with your "
                 "ground station"
             )
-            self._flight.send(encode_from_guard(late))
+            self._flight.send(encode(late))
 
     def _forward(self, arrivals: LinkArrivals) -> int:
         """Pass samples and packets on. Return the arrival of the last packet, or 0."""
         # The flight process does not read samples before a policy is loaded; keep the queue free.
         if arrivals.samples and self.guard is not None:
-            self._samples.send(encode_samples(arrivals.samples))
+            self._samples.send(encode(Samples(arrivals.samples)))
         if arrivals.packets and self.guard is not None:
-            self._flight.send(encode_from_guard(Packets(arrivals.packets)))
+            self._flight.send(encode(Packets(arrivals.packets)))
         return arrivals.packets[-1].arrived_ns if arrivals.packets else 0
 
     def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
@@ -308,7 +308,7 @@ class GuardLoop:
             self._vehicle = vehicle
             self._report_status(vehicle)
         for text in snapshot.texts:
-            self._flight.send(encode_from_guard(text))
+            self._flight.send(encode(text))
 
     def _report_status(self, vehicle: VehicleStatus | None) -> None:
         settings = None if self.guard is None else self.guard.settings
@@ -324,7 +324,7 @@ class GuardLoop:
             has_position=watches_position and bool(vehicle and vehicle.position_ned_m),
         )
         if status != self._status:  # one that the channel did not take is sent again
-            self._status = status if self._flight.send(encode_from_guard(status)) else None
+            self._status = status if self._flight.send(encode(status)) else None
 
     def _receive(self, snapshot: LinkSnapshot) -> GuardInput:
         """Read the messages of the flight process; keep the newest of each kind."""
@@ -379,7 +379,7 @@ class GuardLoop:
                 text = f"neutral: {reason}"
             case Phase.HOLDING if self.guard is not None:
                 text = f"neutral sticks go on until {self.guard.ways_out}"
-                self._flight.send(encode_from_guard(text))
+                self._flight.send(encode(text))
             case Phase.RELEASING | Phase.RELEASED if before in _HELD:
                 text = f"control given back: {reason}"
         if text is not None:

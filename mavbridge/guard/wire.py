@@ -1,32 +1,19 @@
-"""Encoding of the messages between the flight process and the guard.
+"""Encoding of the messages between the flight process and the guard: pickles.
 
-Samples and chunks, which lie between an attitude and its command, are little-endian structures; all
-others are pickles. Pickles are safe here: one process has started the other, and no third one has
-an end of the channel.
+They are safe here: one process has started the other, and no third one has an end of the channel.
 """
 
 import io
 import pickle
-import struct
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from itertools import chain
 from typing import Any, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import (
-    ACTION_CLASSES,
-    ForwardedPacket,
-    LinkStats,
-    Reading,
-    Sample,
-    Sticks,
-    Telemetry,
-)
+from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Sample, Sticks
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import (
     EndRequest,
@@ -37,16 +24,8 @@ from mavbridge.guard.values import (
     Phase,
 )
 
-_CHUNK = struct.Struct("<cBqqqqqqqqH")
-_ACTION = struct.Struct("<4d")
-_QUANTITIES = Telemetry._fields
-_SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
-"""Layout of a sample by quantity: index, arrival, delay, values."""
-_CLASSES = tuple(ACTION_CLASSES.values())
-_PICKLE = b"S"
 _MALFORMED = (
-    *(struct.error, pickle.UnpicklingError, EOFError),
-    *(ValueError, TypeError, LookupError, AttributeError),
+    *(pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError),
 )
 """Errors of the decoders on malformed bytes."""
 
@@ -131,42 +110,36 @@ FromGuard: TypeAlias = (
 )
 """Text is one line for the user; an error ends the guard."""
 
-_TO_GUARD = (GuardSettings, FlightSettings, Reason, str, EndRequest)
+_TO_GUARD = (GuardSettings, FlightSettings, Chunk, Reason, str, EndRequest)
 
 
-def encode_to_guard(message: ToGuard) -> bytes:
-    """Encode a message of the flight process."""
-    if not isinstance(message, Chunk):
-        return _pickled(message)
-    stamps = (*message[:7], message.reset_ns)
-    count = len(message.actions)
-    values = chain.from_iterable(message.actions)
-    kind = _CLASSES.index(type(message.actions[0])) if count else 0
-    return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
+def encode(message: ToGuard | FromGuard) -> bytes:
+    """Encode a message of either process."""
+    file = io.BytesIO()
+    _Pickler(file).dump(message)
+    return file.getvalue()
 
 
 def decode_to_guard(data: bytes) -> ToGuard:
     """Decode a message of the flight process; raise ValueError if it is malformed."""
-    try:
-        message: ToGuard = _decode_chunk(data) if data[:1] == b"C" else _unpickled(data, _TO_GUARD)
-    except _MALFORMED as error:
-        raise ValueError(f"not a message to the guard: {data[:16]!r}") from error
+    message: ToGuard = _decode(data, _TO_GUARD)
     return message
-
-
-def encode_from_guard(message: FromGuard) -> bytes:
-    """Encode a message of the guard."""
-    return encode_samples(message.samples) if isinstance(message, Samples) else _pickled(message)
 
 
 def decode_from_guard(data: bytes) -> FromGuard:
     """Decode a message of the guard; raise ValueError if it is malformed."""
+    message: FromGuard = _decode(data, get_args(FromGuard))
+    return message
+
+
+def _decode(data: bytes, kinds: tuple[type, ...]) -> Any:
+    message: object = None
     try:
-        if data[:1] == b"R":
-            return Samples(tuple(decode_samples(data)))
-        message: FromGuard = _unpickled(data, get_args(FromGuard))
+        message = _Unpickler(io.BytesIO(data)).load()
     except _MALFORMED as error:
-        raise ValueError(f"not a message of the guard: {data[:16]!r}") from error
+        raise ValueError(f"not a message: {data[:16]!r}") from error
+    if not isinstance(message, kinds):
+        raise ValueError(f"not a message of that process: {message!r}")  # noqa: TRY004 - malformed
     return message
 
 
@@ -178,7 +151,9 @@ class _Pickler(pickle.Pickler):
     """
 
     def reducer_override(self, value: Any) -> Any:
-        """Return how to rebuild an Enum's member, or a scalar of another type; NotImplemented."""
+        """Return how to rebuild an object; NotImplemented leaves it to pickle."""
+        if isinstance(value, tuple):  # a NamedTuple, in half of pickle's own time
+            return type(value), tuple(value)
         if not type(value).__module__.startswith("mavbridge."):
             for plain in (str, int, float):
                 if isinstance(value, plain):
@@ -204,43 +179,3 @@ class _Unpickler(pickle.Unpickler):
         if not isinstance(found, type):
             raise pickle.UnpicklingError(f"{module}.{name} is no part of a message")
         return found
-
-
-def _pickled(message: object) -> bytes:
-    file = io.BytesIO()
-    _Pickler(file).dump(message)
-    return _PICKLE + file.getvalue()
-
-
-def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
-    message = _Unpickler(io.BytesIO(data[1:])).load() if data[:1] == _PICKLE else None
-    if not isinstance(message, classes):
-        raise ValueError("unknown kind")  # noqa: TRY004 - same error as for other malformed messages
-    return message
-
-
-def _decode_chunk(data: bytes) -> Chunk:
-    _, kind, *stamps, reset_ns, count = _CHUNK.unpack_from(data)
-    if len(data) != _CHUNK.size + count * _ACTION.size:
-        raise ValueError("a chunk of another length")
-    actions = _ACTION.iter_unpack(memoryview(data)[_CHUNK.size :])
-    return Chunk._make((*stamps, tuple(map(_CLASSES[kind]._make, actions)), reset_ns))
-
-
-def encode_samples(samples: Iterable[Sample]) -> bytes:
-    """Encode readings of the vehicle, in order of arrival."""
-    parts = [b"R"]
-    for name, (arrived_ns, values, delay_ns) in samples:
-        number = _QUANTITIES.index(name)
-        parts.append(_SAMPLES[number].pack(number, arrived_ns, delay_ns, *values))
-    return b"".join(parts)
-
-
-def decode_samples(data: bytes) -> Iterator[Sample]:
-    """Decode readings; the data must come from ``encode_samples``."""
-    at = 1
-    while at < len(data):
-        layout = _SAMPLES[data[at]]
-        number, arrived_ns, delay_ns, *values = layout.unpack_from(data, at)
-        yield Sample(_QUANTITIES[number], Reading(arrived_ns, tuple(values), delay_ns))
-        at += layout.size

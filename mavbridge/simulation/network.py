@@ -11,7 +11,7 @@ from functools import partial
 from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.loop import GuardLoop
-from mavbridge.guard.wire import ToGuard, decode_from_guard, encode_to_guard
+from mavbridge.guard.wire import ToGuard, decode_from_guard, encode
 from mavbridge.mavlink.transport.connection import Address, Received, Transport
 from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
 
@@ -134,7 +134,7 @@ def sender(world: SteppedClock, clock: AheadClock, port: MemoryPort) -> Callable
     """Return a function that sends messages to the guard at the time on ``clock``."""
 
     def send(message: ToGuard) -> None:
-        data = encode_to_guard(message)
+        data = encode(message)
         world.schedule(clock.now_ns(), partial(port.send, data))
 
     return send

@@ -27,7 +27,7 @@ from mavbridge.flight.settings import link_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
-from mavbridge.guard.wire import LastWords, ToGuard, encode_to_guard
+from mavbridge.guard.wire import LastWords, ToGuard, encode
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock
 from mavbridge.simulation.network import DelayedChannel, GuardStepper, MemoryPort, flight_process
@@ -82,14 +82,14 @@ class GuardFlight(LinkedVehicle):
         raise NotImplementedError
 
     def _send(self, message: ToGuard) -> None:
-        data = encode_to_guard(message)
+        data = encode(message)
         at_ns = self._policy_clock.now_ns()
         self.clock.schedule(
             at_ns, lambda: None if self.is_flight_process_stopped else self._port.send(data)
         )
 
     def tell(self, message: ToGuard) -> None:
-        self._port.send(encode_to_guard(message))
+        self._port.send(encode(message))
 
     def act(self, act: OperatorCommand) -> None:
         self.tell(act)

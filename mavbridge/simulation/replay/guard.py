@@ -26,7 +26,7 @@ from mavbridge.guard.chunks import GRACE_PERIODS, LEAST_GRACE_NS, MAX_REFUSED, C
 from mavbridge.guard.guard import Guard, GuardInput
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, FlightSettings, OperatorCommand, Phase
-from mavbridge.guard.wire import ToGuard, decode_from_guard, encode_to_guard
+from mavbridge.guard.wire import ToGuard, decode_from_guard, encode
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.connection import (
     REOPEN_NS,
@@ -87,7 +87,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     given: list[tuple[int, GuardInput]] = []
     loop = GuardLoop(clock, link, port, watch_input=lambda *step: given.append(step))
     settings = recorded_plan(source).guard
-    port.inbox.append(encode_to_guard(settings))
+    port.inbox.append(encode(settings))
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps: list[GuardStep] = []
@@ -102,7 +102,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
                 _keep_link(link, clock, transport, min(told_ns, tick.woke_ns, tick.due_ns - 1))
                 told_ns = clock.now_ns()
             if told_ns < tick.due_ns:  # else in the pass of the tick
-                port.inbox.append(encode_to_guard(absence))
+                port.inbox.append(encode(absence))
                 loop.step()
                 absence = None
         if steps and steps[-1].recorded.phase == tick.phase == Phase.PREPARING:
@@ -115,7 +115,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
         before, codes = codes, tick.release_reason.codes if tick.release_reason else ()
         transport.is_lost = Code.CONNECTION_LOST in codes and Code.CONNECTION_LOST not in before
         messages: tuple[ToGuard | None, ...] = (chunk, absence, act, stop)
-        port.inbox += [encode_to_guard(each) for each in messages if each is not None]
+        port.inbox += [encode(each) for each in messages if each is not None]
         loop.step()
         steps.append(GuardStep(recorded=tick, replayed=port.take_tick(), given=tuple(given)))
         given.clear()

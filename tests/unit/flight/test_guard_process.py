@@ -31,7 +31,7 @@ from mavbridge.flight.guard_process import (
 )
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.values import GuardSettings, Phase
-from mavbridge.guard.wire import GuardDiedError, LastWords, encode_from_guard
+from mavbridge.guard.wire import GuardDiedError, LastWords, encode
 
 MS = NS_PER_MS
 PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
@@ -72,10 +72,10 @@ class Rig:
         packets: tuple[tuple[int, bytes], ...] = PACKETS,
     ) -> None:
         words = LastWords(phase, "BRAKE", receiver, fd is not None, packets)
-        assert self.port.send(encode_from_guard(words), fd)
+        assert self.port.send(encode(words), fd)
 
     def tick(self, phase: Phase = Phase.FLYING) -> None:
-        self.port.send(encode_from_guard(make_guard_tick(self.clock.now_ns(), phase=phase)))
+        self.port.send(encode(make_guard_tick(self.clock.now_ns(), phase=phase)))
 
     def die(self, returncode: int | None = -9) -> str:
         """Returns what the user is told."""
@@ -261,7 +261,7 @@ def test_nothing_is_sent_where_it_would_be_wrong(rig: Rig, case: str) -> None:
     elif case == "old":
         rig.clock.advance_ns(LATEST_NS + MS)
     if case == "a bug":  # it has said them itself
-        rig.port.send(encode_from_guard(GuardDiedError("Traceback")))
+        rig.port.send(encode(GuardDiedError("Traceback")))
     text = rig.die(None if case == "alive" else -9)
     assert link.heard() == []
     assert ("its own timeout" in text) == (case in ("old", "alive"))

@@ -15,7 +15,7 @@ from mavbridge.core.vehicle import Reading, Sticks, Telemetry
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardDiedError, GuardStatus, Samples, encode_samples
+from mavbridge.guard.wire import GuardDiedError, GuardStatus, Samples, encode
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -73,7 +73,7 @@ class Awaited(NamedTuple):
     port: SocketPort
 
     def send(self, telemetry: Telemetry) -> None:
-        assert self.port.send(encode_samples(samples_of(telemetry)))
+        assert self.port.send(encode(Samples(samples_of(telemetry))))
 
 
 def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:

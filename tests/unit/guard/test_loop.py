@@ -22,7 +22,7 @@ from mavbridge.guard.wire import (
     Samples,
     ToGuard,
     decode_from_guard,
-    encode_to_guard,
+    encode,
 )
 
 MS = NS_PER_MS
@@ -67,13 +67,13 @@ class Rig:
         self.clock = FakeClock(oversleep_ns=oversleep_ns)
         self.link = FakeLink(self.clock, **status)
         self.port = FakePort()
-        received = [encode_to_guard(message) for message in first or []]
+        received = [encode(message) for message in first or []]
         self.loop = GuardLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
         self.solves = True
         self.serial = 0
 
     def tell(self, *messages: ToGuard) -> None:
-        self.port.inbox += [encode_to_guard(message) for message in messages]
+        self.port.inbox += [encode(message) for message in messages]
 
     def chunk(self) -> Chunk:
         self.serial += 1
