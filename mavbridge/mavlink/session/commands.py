@@ -1,27 +1,20 @@
-"""Commands for mode, arming and takeoff, with rate limits and the vehicle's answers."""
+"""Commands for mode, arming and takeoff, and the vehicle's answers to them."""
 
 from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import Clock
 from mavbridge.core.vehicle import AdviceText
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
-_SPACING_NS = NS_PER_S
-"""Time between two requests to arm or take off: each refusal prints the vehicle's reason."""
-_MODE_SPACING_NS = 50 * NS_PER_MS
-"""Lower bound only: the caller sets the rate, and a lost request at the end of a flight must not
-cost a second."""
 _SET_MODE = dialect.MAV_CMD_DO_SET_MODE
 _ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
-_FORGET_NS = 3 * NS_PER_S
-"""Time without requests for a mode after which its refusal is forgotten."""
 
 
 class VehicleCommands:
-    """Rate-limited requests to the present vehicle."""
+    """Requests to the present vehicle, as often as the caller makes them."""
 
     def __init__(
         self,
@@ -31,7 +24,8 @@ class VehicleCommands:
     ) -> None:
         self._send, self._report, self._clock = send, report, clock
         self._vehicle: VehicleSession | None = None
-        self._sent: dict[int, tuple[int, CommandRequest]] = {}
+        self._sent: set[int] = set()
+        """Commands that the vehicle has got from us."""
         self._mode: str | None = None
         self.refused_mode: str | None = None
         """Mode of the last request if the vehicle has refused it, else None."""
@@ -42,27 +36,22 @@ class VehicleCommands:
         self._sent.clear()
 
     def set_mode(self, mode: str) -> None:
-        """Request a flight mode, the same one at most every 50 ms.
+        """Request a flight mode.
 
         Raises:
             UserError: the vehicle has no mode of this name.
         """
-        if self._vehicle is None:
-            return
-        request = self._vehicle.profile.modes.command(mode)
-        now_ns = self._clock.now_ns()
-        last_ns, last = self._sent.get(_SET_MODE, (now_ns, None))
-        if mode != self._mode or now_ns - last_ns > _FORGET_NS:
+        if self._vehicle is not None:
+            request = self._vehicle.profile.modes.command(mode)
             self._mode, self.refused_mode = mode, None
-        if request != last or now_ns - last_ns >= _MODE_SPACING_NS:
-            self._put(request, now_ns)
+            self._request(request)
 
     def arm(self) -> None:
-        """Request arming, at most once a second."""
+        """Request arming."""
         self._request(CommandRequest(_ARM, (1,)))
 
     def takeoff(self, height_m: float) -> None:
-        """Request an autonomous takeoff to a height above ground, at most once a second in all."""
+        """Request an autonomous takeoff to a height above ground."""
         if self._vehicle is None:
             return
         now_ns = self._clock.now_ns()
@@ -74,13 +63,7 @@ class VehicleCommands:
             self._report(AdviceText(unknown))
 
     def _request(self, request: CommandRequest) -> None:
-        now_ns = self._clock.now_ns()
-        last = self._sent.get(request.command)
-        if last is None or now_ns - last[0] >= _SPACING_NS:
-            self._put(request, now_ns)
-
-    def _put(self, request: CommandRequest, now_ns: int) -> None:
-        self._sent[request.command] = now_ns, request
+        self._sent.add(request.command)
         self._send(request)
 
     def receive(self, ack: CommandAck) -> None:

@@ -378,14 +378,11 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     assert "is ignored: the vehicle is at 127.0.0.1:1" in told[0]
 
 
-def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() -> None:
+def test_mode_and_arm_are_requested_and_refusals_are_reported() -> None:
     rig = Rig().ready()
-    for _ in range(150):
-        rig.link.commands.set_mode("ACRO")
-        rig.link.commands.arm()
-        rig.run(0.01)
-    assert rig.commands(176) == [(1, 1)] * 30  # every 50 ms
-    assert rig.commands(400) == [(1, 0)] * 2  # once a second
+    rig.link.commands.set_mode("ACRO")
+    rig.link.commands.arm()
+    assert (rig.commands(176), rig.commands(400)) == ([(1, 1)], [(1, 0)])
     rig.vehicle.put(rig.vehicle.end.mav.command_ack_encode(400, dialect.MAV_RESULT_FAILED))
     rig.vehicle.put(rig.vehicle.end.mav.statustext_encode(2, b"Arm: Throttle too high"))
     rig.run(0.01)
