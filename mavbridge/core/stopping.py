@@ -1,5 +1,6 @@
 """Threads that can be told to stop, stop signals of a flight, and a bounded end of the process."""
 
+import math
 import os
 import queue
 import signal
@@ -120,6 +121,23 @@ def stop_signals() -> list[int]:
     return [signal.SIGTERM, *handled]
 
 
+def _on_signal(stop: StopRequest, noted: float) -> Callable[[int, FrameType | None], None]:
+    """Return a handler that only notes so many requests; the next one raises KeyboardInterrupt, and
+    one after that exits at once."""
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        stop.signal_number = stop.signal_number or number
+        before = stop.requests
+        stop.set()
+        if stop.requests == before or before < noted:
+            return
+        if before == noted:
+            raise KeyboardInterrupt
+        os._exit(128 + number)
+
+    return handle
+
+
 @contextmanager
 def stop_on_signals(*, is_bounded: bool = False) -> Iterator[StopRequest]:
     """Context manager: the signals of ``stop_signals`` request the stop.
@@ -128,18 +146,8 @@ def stop_on_signals(*, is_bounded: bool = False) -> Iterator[StopRequest]:
     hang, unless the block ``is_bounded``: it ends by deadlines of its own.
     """
     stop = StopRequest()
-
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        stop.signal_number = stop.signal_number or number
-        before = stop.requests
-        stop.set()
-        if is_bounded or before == 0 or stop.requests == before:
-            return
-        if before > 1:
-            os._exit(128 + number)
-        raise KeyboardInterrupt
-
-    previous = {number: signal.signal(number, on_signal) for number in stop_signals()}
+    handle = _on_signal(stop, math.inf if is_bounded else 1)
+    previous = {number: signal.signal(number, handle) for number in stop_signals()}
     try:
         yield stop
     finally:
@@ -153,21 +161,9 @@ def interrupt_once(clock: Clock | None = None) -> None:
     A second KeyboardInterrupt would interrupt the clean-up of the first with a traceback. The guard
     handles the exit like any other death of this process.
     """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        return  # ignored, as shells start programs in the background
-    clock = MonotonicClock() if clock is None else clock
-    first_ns: int | None = None
-
-    def interrupt(*_: object) -> None:
-        nonlocal first_ns
-        now_ns = clock.now_ns()
-        if first_ns is None:
-            first_ns = now_ns
-            raise KeyboardInterrupt
-        if now_ns - first_ns >= ONE_REQUEST_NS:
-            os._exit(INTERRUPTED)
-
-    signal.signal(signal.SIGINT, interrupt)
+    # Ignored, as shells start programs in the background, it stays so.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _on_signal(StopRequest(clock), 0))
 
 
 def end_process(

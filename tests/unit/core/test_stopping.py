@@ -104,7 +104,7 @@ def test_ctrl_c_is_one_request_for_a_moment_and_then_an_end(
         clock.advance_ns(ONE_REQUEST_NS - 1)
         signal.raise_signal(signal.SIGINT)
         assert statuses == []
-        clock.advance_ns(1)
+        clock.advance_ns(ONE_REQUEST_NS)
         signal.raise_signal(signal.SIGINT)
         assert statuses == [INTERRUPTED]
     finally:
