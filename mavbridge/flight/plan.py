@@ -1,10 +1,12 @@
 """Everything that follows from a flight's flags and contract, resolved once."""
 
+import math
 from dataclasses import asdict, dataclass
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import LoopRates
 from mavbridge.core.clock import NS_PER_S, period_ns
+from mavbridge.core.errors import PolicyError
 from mavbridge.flight.settings import (
     AGES,
     TAU_S,
@@ -19,6 +21,9 @@ from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.values import FlightSettings
 from policy.contract import Contract
+
+PERIOD_TOLERANCE = 0.01
+"""Fraction by which a horizon may be shorter than the chunk period: 0.033 s for 30 Hz."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,11 +65,13 @@ def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> Flig
 
     Raises:
         UserError: a flag contradicts the contract.
+        PolicyError: a chunk ends before the next one is due.
     """
     rates, limits = config.rates, config.limits
     loops = rates.loops(is_dual=is_dual, play_s=contract.play_s)
     start_limits = effective_freshness(contract, limits)
     require_goal(config, contract)
+    _require_horizon(contract, loops.action_hz, "rates.action" if is_dual else "rates.single")
     guard = FlightSettings(
         stick_period_ns=period_ns(rates.stick_rate),
         chunk_period_ns=period_ns(loops.action_hz),
@@ -88,3 +95,23 @@ def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> Flig
         start_limits=start_limits,
         guard=guard,
     )
+
+
+def _require_horizon(contract: Contract, action_hz: float, flag: str) -> None:
+    horizon_s = contract.horizon * contract.chunk_dt_s
+    if horizon_s < (1 - PERIOD_TOLERANCE) / action_hz:
+        least_hz = math.ceil(1 / horizon_s - 1e-6)
+        raise PolicyError(
+            f"the policy has a horizon of {duration_text(horizon_s)} ({contract.horizon} x "
+            f"{duration_text(contract.chunk_dt_s)}), shorter than the "
+            f"{duration_text(1 / action_hz)} between two solves at {action_hz:.3g} chunks a "
+            f"second: use {flag} {least_hz} or more, or correct horizon and chunk_dt_s in its "
+            "contract"
+        )
+
+
+def duration_text(duration_s: float) -> str:
+    """Return a duration in s or ms, for a message."""
+    if duration_s >= 1:
+        return f"{duration_s:.3g} s"
+    return f"{duration_s * 1e3:.{0 if duration_s >= 0.01 else 1}f} ms"

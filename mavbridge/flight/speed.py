@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PolicyError
-from mavbridge.flight.plan import FlightPlan
-from mavbridge.guard.chunks import PERIOD_TOLERANCE, FreshnessLimits
+from mavbridge.flight.plan import PERIOD_TOLERANCE, FlightPlan, duration_text
+from mavbridge.guard.chunks import FreshnessLimits
 from policy.contract import Contract
 from policy.errors import warned
 from policy.loading.request import SolveTimes
@@ -63,17 +63,19 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
     if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
         notes.append(
             f"{action_hz:.3g} chunks a second, since this policy plays each one for "
-            f"{_text(contract.play_s)}; {flag} sets another rate"
+            f"{duration_text(contract.play_s)}; {flag} sets another rate"
         )
-    _require_horizon(name, contract, action_hz, flag)
     if times is None:
         return tuple(notes)
-    figures = f"a chunk takes {_text(times.act_s)} here, an image {_text(times.encode_s)}"
+    figures = (
+        f"a chunk takes {duration_text(times.act_s)} here, an image {duration_text(times.encode_s)}"
+    )
     limits = plan.start_limits
     worst = _worst(contract, limits, times, action_hz=action_hz, image_hz=image_hz)
     told = (
         f"{figures}; at {action_hz:.3g} chunks and {image_hz:.3g} images a second, {worst.what} up "
-        f"to {_text(worst.reached_s)} old, beyond the {_text(worst.allowed_s)} of its {worst.by}"
+        f"to {duration_text(worst.reached_s)} old, beyond the {duration_text(worst.allowed_s)} of "
+        f"its {worst.by}"
     )
     if worst.share > CLEARLY:
         fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
@@ -91,19 +93,6 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
             reached = f"this computer reaches about {1 / each_s:.2g}"
             notes.append(warned(f"{asked_hz:.3g} {what} a second wanted, {reached}: {figures}"))
     return tuple(notes)
-
-
-def _require_horizon(name: str, contract: Contract, action_hz: float, flag: str) -> None:
-    """Raise PolicyError if a chunk ends before the next one is due."""
-    horizon_s = contract.horizon * contract.chunk_dt_s
-    if horizon_s < (1 - PERIOD_TOLERANCE) / action_hz:
-        least_hz = math.ceil(1 / horizon_s - 1e-6)
-        raise PolicyError(
-            f"{name} has a horizon of {_text(horizon_s)} ({contract.horizon} x "
-            f"{_text(contract.chunk_dt_s)}), shorter than the {_text(1 / action_hz)} between two "
-            f"solves at {action_hz:.3g} chunks a second: use {flag} {least_hz} or more, or "
-            "correct horizon and chunk_dt_s in its contract"
-        )
 
 
 def _worst(
@@ -134,9 +123,3 @@ def _worst(
         _Age(f"{sent}the image is", image_s + state_s, played.feature_ns / NS_PER_S),
     )
     return max(ages, key=lambda age: age.share)
-
-
-def _text(duration_s: float) -> str:
-    if duration_s >= 1:
-        return f"{duration_s:.3g} s"
-    return f"{duration_s * 1e3:.{0 if duration_s >= 0.01 else 1}f} ms"

@@ -20,8 +20,6 @@ _MALFORMED = (Code.EMPTY_CHUNK, Code.WRONG_KIND, Code.NOT_FINITE, Code.WRONG_SHA
 REFUSED_WINDOW_NS = NS_PER_S
 REFUSED_WINDOW_PERIODS = 10
 RECENT_GAPS = 8
-PERIOD_TOLERANCE = 0.01
-"""Fraction by which a horizon may be shorter than the chunk period: 0.033 s for 30 Hz."""
 LEAST_GAPS = 2
 """Gaps between chunks that must have been seen before a flight may begin."""
 SLOW_CHUNKS = 5
@@ -222,8 +220,6 @@ class ChunkBuffer:
     @property
     def impossibility(self) -> Reason | None:
         """Why the policy can never fly on this computer at this rate; None: it can."""
-        if self._is_short and (short := self._shortness()) is not None:
-            return short
         if self._slow < SLOW_CHUNKS:
             return None
         return because(
@@ -316,24 +312,18 @@ class ChunkBuffer:
             return None
         return because(Code.UNUSABLE_CHUNKS, chunks=MAX_REFUSED, why=self._malformed[-1][1])
 
-    @property
-    def _is_short(self) -> bool:
-        """True if the newest chunk's horizon is shorter than the chunk period."""
-        chunk, least_ns = self.newest, self._period_ns * (1 - PERIOD_TOLERANCE)
-        return chunk is not None and chunk.horizon_ns < least_ns
-
     def _shortness(self) -> Reason | None:
         """Return the figures of a policy whose chunks end before the next one arrives, or None."""
         chunk, gaps_ns = self.newest, sorted(self._gaps_ns)
         if chunk is None or not gaps_ns:
             return None
         gap_ns, covered_ns = gaps_ns[(len(gaps_ns) - 1) // 2], self._end_ns - self._taken_ns
-        if gap_ns <= covered_ns and not self._is_short:
+        if gap_ns <= covered_ns:
             return None
         return because(
             Code.HORIZON_TOO_SHORT,
             covered_ms=covered_ns / NS_PER_MS,
-            gap_ms=max(gap_ns, self._period_ns) / NS_PER_MS,
+            gap_ms=gap_ns / NS_PER_MS,
             **_horizon(chunk),
         )
 

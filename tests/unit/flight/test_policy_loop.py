@@ -266,7 +266,7 @@ def test_an_attitude_starts_a_solve_from_a_quarter_of_a_period_before_it_is_due(
 
 
 def test_a_slow_policy_tries_again_soon_after_a_solve_without_inputs() -> None:
-    rig = Rig(period_ms=1000)
+    rig = Rig(period_ms=1000, chunk_dt_s=0.5)
     rig.measure().loop.step()  # no image yet
     assert rig.loop.start_ns <= START_NS + RETRY_NS
     run_on(rig, 120)

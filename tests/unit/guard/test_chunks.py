@@ -84,32 +84,6 @@ def test_chunks_that_come_after_their_own_end_do_not_prolong_the_grace() -> None
     assert held.fault(1100 * MS + 1) is not None
 
 
-@pytest.mark.parametrize(
-    ("steps", "step_us", "period_ms", "is_possible"),
-    [
-        (1, 20_000, 20, True),
-        (1, 20_000, 33, False),
-        (1, 32_600, 33, False),
-        (1, 33_300, 33, True),
-        (1, 99_000, 100, True),
-        (16, 50_000, 10, True),
-    ],
-)
-def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
-    steps: int, step_us: int, period_ms: int, is_possible: bool
-) -> None:
-    held = buffer(period_ms)
-    for serial, now_ms in enumerate(range(1000, 1000 + 4 * period_ms, period_ms), start=1):
-        actions = (NEUTRAL,) * steps
-        held.offer(chunk(serial, now_ms, actions=actions, step_ns=step_us * 1000), now_ms * MS)
-    assert (held.impossibility is None) == is_possible
-    assert (held.problem(now_ms * MS) is None) == is_possible
-    if not is_possible:
-        assert codes(held.impossibility) == (Code.HORIZON_TOO_SHORT,)
-        told = figures(held.impossibility, "horizon_ms", "steps", "step_ms", "gap_ms")
-        assert told == (step_us / 1000, 1, step_us / 1000, 33)
-
-
 def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
     for latency_ms, is_covered in ((5, True), (25, False)):
         held = buffer(33)
