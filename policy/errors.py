@@ -38,6 +38,14 @@ class CheckpointError(PolicyError):
     """Checkpoint that cannot be read or does not fit; the message names the next step."""
 
 
+class DatasetError(PolicyError):
+    """Recorded flights or datasets that cannot be used; the message names them and the reason."""
+
+
+class NothingToLearnError(DatasetError):
+    """Flight that adds nothing to others: it is empty or a copy, or nobody flew in it."""
+
+
 class NoChunkError(PolicyError):
     """The policy has no chunk for this state, but may have one for the next state.
 

@@ -19,11 +19,12 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_for_episodes, policy_files
 from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.folder import META, FlightMeta, prepare_folder, read_meta
+from mavbridge.recording.folder import FlightMeta, prepare_folder, read_meta
 from mavbridge.recording.rows import FrameTruth
 from mavbridge.simulation.flight import SIM_CAMERA_PX, SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import Contract
+from policy.data.flight_files import META
 from policy.protocol import PolicyRunner
 from sitl.course import gate_truth
 

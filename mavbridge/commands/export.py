@@ -27,15 +27,10 @@ from mavbridge.core.records import ImageArray
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.contract import ACTION_DIM, STICK_TERMS
 from policy.data import lerobot_format as names
-from policy.data.flight_data import (
-    DatasetError,
-    FlightData,
-    Nanoseconds,
-    common_contract,
-)
+from policy.data.flight_data import FlightData, Nanoseconds, common_contract
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flights
 from policy.data.interpolation import MAX_GAP_NS
-from policy.files import CONTRACT_FILE, read_object
+from policy.files import CONTRACT_FILE
 
 MAX_HELD_NS = MAX_GAP_NS
 """A state or sticks older than this no longer belong to a frame."""
@@ -153,7 +148,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames, status="")
         summary = write_dataset(episodes, folder, config, lambda: progress.advance(writing))
-        write_contract(folder, [Path(each.name) for each in episodes], config)
+        write_contract(folder, episodes, config)
     text_console().print(f"{config.out}: {summary}", soft_wrap=True)
     return 0
 
@@ -196,16 +191,13 @@ def write_dataset(
     )
 
 
-def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
-    """Write the contract file for policies trained on these flights; raise DatasetError."""
-    kind = "flight folder"
-    metas = [read_object(flight / "meta.json", DatasetError, kind) for flight in flights]
-    contracts = [meta.get("contract") for meta in metas]
+def write_contract(dataset: Path, episodes: Sequence[FlightData], config: ExportConfig) -> None:
+    """Write the contract file for policies trained on these flights."""
     # The only camera is the vehicle's own under any name: the contract's default.
     told = ("cameras", *STICK_TERMS)
     entries = [
         *(entry for entry in dataset_entries(dataset) if entry.name not in told),
-        *recorded_entries([each for each in contracts if isinstance(each, dict)]),
+        *recorded_entries([each.contract for each in episodes]),
         Entry("task", "prompt", config.task, "--task"),
     ]
     title = (

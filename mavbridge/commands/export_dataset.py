@@ -24,7 +24,7 @@ from mavbridge.core.records import ImageArray
 from policy.adapters.interface import BODY_STATE_NAMES, state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
-from policy.data.flight_data import DatasetError
+from policy.errors import DatasetError
 from policy.files import library_name
 from policy.preprocess import resize
 

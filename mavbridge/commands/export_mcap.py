@@ -25,9 +25,10 @@ from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ACTION_CLASSES, ActionKind, Sticks
 from mavbridge.observe.images import as_rgb, jpeg
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
-from mavbridge.recording.folder import META, FlightMeta
+from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import TickRow
 from policy.contract import QUATERNION, STATE_NAMES, StateFrame
+from policy.data.flight_files import META
 from policy.data.flight_folders import find_flights
 from policy.motion.rotation import other_frame
 

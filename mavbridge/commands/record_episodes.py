@@ -17,9 +17,10 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.observers import flight_meta
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.codec.tlog import PacketPipe
-from mavbridge.recording.folder import META, FlightMeta, prepare_folder, write_meta
+from mavbridge.recording.folder import FlightMeta, prepare_folder, write_meta
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
+from policy.data.flight_files import META
 
 QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
 KEYS = (QUIT_KEY, TOGGLE_KEY, " ", GOOD_KEY, BAD_KEY)

@@ -13,11 +13,12 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from policy.contract import STICK_TERMS, Contract
-from policy.data.flight_data import DatasetError, FlightData, common_contract
+from policy.data.flight_data import FlightData, common_contract
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flights
 from policy.data.lerobot import read_dataset
 from policy.data.lerobot_format import is_lerobot
 from policy.engines.runner import require_device
+from policy.errors import DatasetError
 from policy.loading.builtin import builtin_config
 from policy.motion.stick_loop import rates_contract
 from policy.nets.toge import TogeConfig

@@ -11,20 +11,12 @@ import pyarrow as pa
 from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Solve, Tick, VisionTick
 from mavbridge.core.vehicle import Action, ForwardedPacket
-from mavbridge.recording import replay_files, rows
-from mavbridge.recording.folder import (
-    FEATURES,
-    FRAMES,
-    PACKETS,
-    SOLVES,
-    TICKS,
-    FlightMeta,
-    of_camera,
-    video_of,
-    write_meta,
-)
+from mavbridge.recording import replay_files
+from mavbridge.recording.folder import FlightMeta, write_meta
 from mavbridge.recording.replay_files import ReplaySettings
 from mavbridge.recording.rows import (
+    DEMONSTRATION_FRAMES,
+    DEMONSTRATION_TICKS,
     FrameRow,
     FrameTruth,
     TickRow,
@@ -35,6 +27,8 @@ from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogPipe
 from mavbridge.recording.video_process import VideoJob
 from mavbridge.recording.video_writer import Pressure, VideoWriter, WriterDiedError, WriterError
+from policy.data.flight_files import FEATURES, FRAMES, PACKETS, SOLVES, TICKS, of_camera, video_of
+from policy.data.tables import FRAME_COLUMNS, TICK_COLUMNS
 
 PACKET_CAPACITY = 60_000
 """Capacity of the queue of packet stamps: one minute of the busiest link."""
@@ -124,8 +118,8 @@ class FlightWriter:
             self._cameras.append(_Camera(name, VideoWriter(job, pressure=pressure)))
 
     def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
-        self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
-        self._frames_schema = rows.DEMONSTRATION_FRAMES if with_labels else rows.FRAMES
+        self._ticks = self._table(TICKS, DEMONSTRATION_TICKS if with_labels else TICK_COLUMNS)
+        self._frames_schema = DEMONSTRATION_FRAMES if with_labels else FRAME_COLUMNS
         self._solves = self._table(SOLVES, replay_files.SOLVES) if with_replay else None
         self._packets = self._table(PACKETS, replay_files.PACKETS) if with_replay else None
         if with_replay and self.meta.mode == "dual":  # else features are only resized images

@@ -1,5 +1,5 @@
-"""A flight's folder: the names of its files, the check that it can be written, and ``meta.json``:
-facts about the flight, its policy and its contract. Imports no extra.
+"""A flight's folder: the check that it can be written, its removal, and ``meta.json``: facts about
+the flight, its policy and its contract. Imports no extra.
 """
 
 import math
@@ -7,38 +7,19 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.errors import UserError
 from mavbridge.core.files import as_json, from_json, write_durably
 from mavbridge.core.records import FlightOutcome
 from policy.contract import Contract
-from policy.errors import ContractError, require_packages
-from policy.files import read_json
+from policy.data import flight_files as files
+from policy.data.flight_files import META, of_camera, read_meta_document, video_of
+from policy.errors import ContractError, DatasetError, require_packages
 
-META = "meta.json"
-TICKS = "ticks"
-FRAMES = "frames"
-"""Stems of the tables: .arrows while they grow, .parquet once they are complete."""
-TLOG = "link.tlog"
-SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
-"""Stems of the tables for a replay."""
-SETTINGS = "settings.json"
 EXTRA = ("av", "pyarrow")
 """Packages of the ``record`` extra."""
-FORMAT = "mavbridge-flight"
-VERSION = 1
 FlightSource = Literal["flight", "demonstration", "dagger", "pilot"]
-
-
-def of_camera(stem: str, camera: str | None) -> str:
-    """Return the stem of a file or table of the first camera (None), or of the named one."""
-    return stem if camera is None else f"{stem}_{camera}"
-
-
-def video_of(camera: str | None) -> str:
-    """Return the file name of a camera's video."""
-    return of_camera("camera", camera) + ".mp4"
 
 
 def require_extra(what: str) -> None:
@@ -71,16 +52,14 @@ def prepare_folder(folder: Path, flag: str) -> None:
 def remove_flight(folder: Path, cameras: Sequence[str]) -> None:
     """Delete the files of a recorded flight; other files, and the folder, stay."""
     names = (None, *cameras[1:])
-    of_cameras = [of_camera(stem, name) for stem in (FRAMES, FEATURES) for name in names]
-    stems = (TICKS, SOLVES, PACKETS, *of_cameras)
+    of_cameras = [
+        of_camera(stem, name) for stem in (files.FRAMES, files.FEATURES) for name in names
+    ]
+    stems = (files.TICKS, files.SOLVES, files.PACKETS, *of_cameras)
     tables = (f"{stem}.{ending}" for stem in stems for ending in ("arrows", "parquet"))
-    for name in (META, SETTINGS, TLOG, *map(video_of, names), *tables):
+    for name in (META, files.SETTINGS, files.TLOG, *map(video_of, names), *tables):
         with suppress(OSError):
             (folder / name).unlink(missing_ok=True)
-
-
-class FlightError(MavbridgeError):
-    """A recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,56 +138,22 @@ class FlightMeta:
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
     """Write or replace ``meta.json``; raise OSError if that fails."""
-    write_durably(folder / META, as_json({"format": FORMAT, "version": VERSION} | vars(meta)))
-
-
-def read_meta(folder: Path) -> FlightMeta:
-    """Read ``meta.json``; raise FlightError if it is missing or not ours."""
-    try:
-        if odd := [each.name for each in folder.iterdir() if not (each.is_file() or each.is_dir())]:
-            raise FlightError(f"{folder / odd[0]} is neither a file nor a folder: leave it out")
-        document: Any = read_json(folder / META)
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise FlightError(_unreadable(folder)) from error
-    except OSError as error:
-        raise FlightError(f"{error.filename} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise FlightError(f"{folder / META} is not JSON: {error}") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise FlightError(f"{folder / META} is not of a recorded flight: no format {FORMAT!r}")
-    if document.get("version") != VERSION:
-        raise FlightError(
-            f"{folder} has version {document.get('version')} of the format, this build reads "
-            f"{VERSION}: use the mavbridge that recorded it"
-        )
-    return _meta(folder, document)
-
-
-def _unreadable(folder: Path) -> str:
-    if not folder.exists():
-        return f"there is no folder {folder}: name one that mavbridge --record made"
-    if not folder.is_dir():
-        return f"{folder} is a file: a recorded flight is a folder, made by mavbridge --record"
-    inside = sorted(entry.name for entry in folder.iterdir())
-    if not inside:
-        return f"{folder} is empty: nothing was recorded there"
-    if flights := sorted(folder.glob(f"*/{META}")):
-        return f"{folder} holds flights, and is none: name one of them ({flights[0].parent})"
-    return (
-        f"{folder} is no recorded flight: it has no {META} (it has {', '.join(inside[:3])}); "
-        "mavbridge --record makes one"
+    write_durably(
+        folder / META, as_json({"format": files.FORMAT, "version": files.VERSION} | vars(meta))
     )
 
 
-def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
+def read_meta(folder: Path) -> FlightMeta:
+    """Read ``meta.json``; raise DatasetError if it is missing, not ours, or damaged."""
+    document = read_meta_document(folder)
     try:
         meta = from_json(FlightMeta, document)
     except (KeyError, TypeError, ValueError, ContractError) as error:
-        raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
+        raise DatasetError(f"{folder / META} is incomplete or damaged: {error}") from error
     for name in ("action_hz", "visual_hz"):
         if not 0 < getattr(meta, name) < math.inf:  # also of NaN
-            raise FlightError(f"{folder / META}: {name} is {getattr(meta, name)}, not above zero")
+            raise DatasetError(f"{folder / META}: {name} is {getattr(meta, name)}, not above zero")
     for name in ("start_ns", "course_seed", "ticks_dropped", "frames_dropped", "packets_dropped"):
         if (getattr(meta, name) or 0) < 0:
-            raise FlightError(f"{folder / META}: {name} is {getattr(meta, name)}, below zero")
+            raise DatasetError(f"{folder / META}: {name} is {getattr(meta, name)}, below zero")
     return meta

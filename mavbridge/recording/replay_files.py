@@ -16,10 +16,12 @@ from mavbridge.core.provenance import without_secrets
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording.folder import SETTINGS, FlightError
-from mavbridge.recording.rows import STATE_STAMPS, attributes, columns, read_reason
+from mavbridge.recording.rows import attributes, read_reason
 from mavbridge.recording.tables import Row, table_rows
 from policy.contract import ACTION_DIM, STATE_DIM, Contract
+from policy.data.flight_files import SETTINGS
+from policy.data.tables import STATE_STAMPS, columns
+from policy.errors import DatasetError
 from policy.files import read_json
 
 _NUMBERS = pa.list_(pa.float32())
@@ -159,15 +161,15 @@ def write_settings(folder: Path, settings: ReplaySettings) -> None:
 
 
 def read_settings(folder: Path) -> ReplaySettings:
-    """Read the file; raise FlightError if it is missing or not of this version."""
+    """Read the file; raise DatasetError if it is missing or not of this version."""
     try:
         return from_json(ReplaySettings, read_json(folder / SETTINGS))
     except FileNotFoundError as error:
-        raise FlightError(
+        raise DatasetError(
             f"{folder} has no {SETTINGS}: it was recorded by an older mavbridge, or is no flight "
             "of mavbridge fly --record; such a flight cannot be replayed"
         ) from error
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise FlightError(
+        raise DatasetError(
             f"{folder / SETTINGS} is damaged, or of another version: {error}"
         ) from error

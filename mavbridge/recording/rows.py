@@ -1,4 +1,4 @@
-"""Rows of a flight's two tables: records, Arrow schemas, and the conversion in both directions.
+"""Rows of a flight's two tables: records, and the conversion from and to columns.
 
 docs/formats.md describes the format. A column is named after the attribute that it holds; a missing
 value is null.
@@ -14,9 +14,15 @@ import pyarrow as pa
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
-from mavbridge.recording.folder import FlightError
 from mavbridge.recording.tables import Row, table_rows
-from policy.contract import ACTION_DIM, STATE_DIM
+from policy.data.tables import (
+    EXPERT_COLUMN,
+    FRAME_COLUMNS,
+    STATE_STAMPS,
+    TICK_COLUMNS,
+    TRUTH_COLUMNS,
+)
+from policy.errors import DatasetError
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -60,60 +66,14 @@ class TickRow(NamedTuple):
     """In a demonstration, the expert's action, without the disturbance that was flown."""
 
 
-_STICKS = pa.list_(pa.float32(), ACTION_DIM)
-_VECTOR = pa.list_(pa.float32(), 3)
-STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
-_TRUTH = tuple(field.name for field in fields(FrameTruth))
+_TRUTH = tuple(field.name for field in TRUTH_COLUMNS)
 _POSE = _TRUTH[:3]
-
-
-def columns(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
-    """Return fields of one type."""
-    return [pa.field(name, kind, nullable=nullable) for name in names]
-
-
-TICKS = pa.schema(
-    [
-        *columns(pa.int64(), "index", "due_ns", "woke_ns", "sent_ns", nullable=False),
-        pa.field("missed_slots", pa.int32(), nullable=False),
-        *columns(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
-        pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
-        *columns(pa.int64(), *STATE_STAMPS),
-        *columns(_STICKS, *ActionTrace._fields, "sent", "rc_sticks"),
-        pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
-        *columns(pa.string(), "release_reason", "release_code", "release_data", "mode"),
-        pa.field("armed", pa.bool_(), nullable=False),
-        pa.field("texts", pa.list_(pa.string()), nullable=False),
-        pa.field("dropped_before", pa.int32(), nullable=False),
-        *columns(pa.bool_(), "is_slot", "is_coasting", nullable=False),
-        *columns(pa.int64(), "chunk_serial", "chunk_computed_ns"),
-        pa.field("phase", pa.string()),
-        pa.field("position_ned_m", _VECTOR),
-        pa.field("decided_ns", pa.int64()),
-    ]
-)
-DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
-
-_FRAME_STAMPS = columns(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
-FRAMES = pa.schema([*_FRAME_STAMPS, pa.field("dropped_before", pa.int32(), nullable=False)])
-DEMONSTRATION_FRAMES = pa.schema(
-    [
-        *FRAMES,
-        pa.field("position_ned_m", _VECTOR),
-        pa.field("ned_from_body_wxyz", pa.list_(pa.float32(), 4)),
-        pa.field("velocity_ned_mps", _VECTOR),
-        pa.field("next_gate", pa.int32()),
-        pa.field("gate_body_m", _VECTOR),
-        pa.field("gate_yaw_rad", pa.float32()),
-        pa.field("gate_after_body_m", _VECTOR),
-    ]
-)
-"""Columns with the truth: all null if it was not given; otherwise its pose is never null."""
-
+DEMONSTRATION_TICKS = TICK_COLUMNS.append(EXPERT_COLUMN)
+DEMONSTRATION_FRAMES = pa.schema([*FRAME_COLUMNS, *TRUTH_COLUMNS])
 _TICK = tuple(
     field.name
     for field in fields(Tick)
-    if field.name in TICKS.names and field.name != "release_reason"
+    if field.name in TICK_COLUMNS.names and field.name != "release_reason"
 )
 """Columns that hold a ``Tick`` attribute unchanged."""
 
@@ -145,7 +105,7 @@ def _reason_columns(reason: Reason | None) -> Row:
 
 def frame_columns(row: FrameRow) -> Row:
     """Convert a frame to a row; the truth has columns in ``DEMONSTRATION_FRAMES`` only."""
-    return attributes(row, FRAMES.names) | attributes(row.truth, _TRUTH)
+    return attributes(row, FRAME_COLUMNS.names) | attributes(row.truth, _TRUTH)
 
 
 def attributes(source: object | None, names: Iterable[str]) -> Row:
@@ -154,11 +114,11 @@ def attributes(source: object | None, names: Iterable[str]) -> Row:
 
 
 def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
-    """Return the ticks of a table with actions of this kind; raise FlightError for torn ones."""
+    """Return the ticks of a table with actions of this kind; raise DatasetError for torn ones."""
     for whole, parts in (("state", STATE_STAMPS), ("raw", ActionTrace._fields)):
         there = table.filter(table[whole].is_valid())
         if torn := [name for name in parts if there[name].null_count]:
-            raise FlightError(f"ticks have {whole} without {', '.join(torn)}: see docs/formats.md")
+            raise DatasetError(f"ticks have {whole} without {', '.join(torn)}: see docs/formats.md")
     serial, make = -1, ACTION_CLASSES[action]
     readonly = table.column("sent").null_count == table.num_rows
     for row in table_rows(table, ("state",)):
@@ -167,7 +127,7 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
         yield TickRow(tick, row["dropped_before"], expert and make(*expert))
 
 
-def read_frames(table: pa.Table) -> Iterator[FrameRow]:
+def read_frame_rows(table: pa.Table) -> Iterator[FrameRow]:
     """Return the records of a table of frames."""
     for row in table_rows(table):
         truth = None
@@ -175,7 +135,7 @@ def read_frames(table: pa.Table) -> Iterator[FrameRow]:
             values: dict[str, Any] = {name: row.get(name) for name in _TRUTH}
             lists = {name: tuple(v) for name, v in values.items() if isinstance(v, list)}
             truth = FrameTruth(**(values | lists))
-        yield FrameRow(**{name: row[name] for name in FRAMES.names}, truth=truth)
+        yield FrameRow(**{name: row[name] for name in FRAME_COLUMNS.names}, truth=truth)
 
 
 def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: bool) -> Tick:
@@ -196,7 +156,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: boo
 
 
 def read_reason(code: str | None, data: str) -> Reason | None:
-    """Restore a reason from its code and its figures in JSON; raise FlightError if invalid."""
+    """Restore a reason from its code and its figures in JSON; raise DatasetError if invalid."""
     if code is None:
         return None
     try:
@@ -204,6 +164,6 @@ def read_reason(code: str | None, data: str) -> Reason | None:
         str(reason)  # an older version had other figures
         return reason
     except (KeyError, TypeError, ValueError) as error:
-        raise FlightError(
+        raise DatasetError(
             f"no reason {code!r} with {data} is known here: use the mavbridge that recorded it"
         ) from error

@@ -5,20 +5,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
-
-from policy.data.flight_data import DatasetError
-from policy.data.tables import read_rows
 
 Row: TypeAlias = dict[str, object]
 """Values by column."""
 FLUSH_NS = 500_000_000
 """Longest span of events that a crash can lose."""
-_ADVICE = "another program or version wrote it"
 _ROWS_AT_ONCE = 4_096
 _GROUP_ROWS = 2_048
 """Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
@@ -92,34 +85,6 @@ class TableWriter:
         self._sink.close()
 
 
-def read_table(
-    stem: Path,
-    schema: pa.Schema,
-    *,
-    optional: Iterable[pa.Field] = (),
-    damage: list[str] | None = None,
-) -> pa.Table:
-    """Read the table with this stem in either format; of a cut-off stream, the complete batches.
-
-    A sentence about any loss is appended to ``damage``. ``dropped_before`` includes damaged rows.
-    Columns of ``optional`` may be absent.
-
-    Raises:
-        DatasetError: the table is missing or damaged, or lacks a column of ``schema``.
-    """
-    return count_lost(*read_numbered(stem, schema, optional=optional, damage=damage))
-
-
-def count_lost(table: pa.Table, numbers: NDArray[np.int64]) -> pa.Table:
-    """Add the rows that are missing between these numbers to ``dropped_before``."""
-    lost = np.diff(numbers, prepend=-1) - 1
-    if not lost.any():
-        return table
-    column = table.schema.get_field_index("dropped_before")
-    counts = table.column(column).to_numpy() + lost
-    return table.set_column(column, table.field(column), pa.array(counts.astype(np.int32)))
-
-
 def table_rows(table: pa.Table, arrays: tuple[str, ...] = ()) -> Iterator[dict[str, Any]]:
     """Yield rows by column; ``arrays`` name those of numbers, which become read-only arrays.
 
@@ -132,39 +97,3 @@ def table_rows(table: pa.Table, arrays: tuple[str, ...] = ()) -> Iterator[dict[s
                 values = batch.column(name)[number].values
                 row[name] = None if values is None else values.to_numpy()  # read-only
             yield row
-
-
-def table_exists(stem: Path) -> bool:
-    """True if there is a table, complete or still growing."""
-    return any(stem.with_suffix(end).exists() for end in (".parquet", ".arrows"))
-
-
-def read_numbered(
-    stem: Path,
-    schema: pa.Schema,
-    *,
-    optional: Iterable[pa.Field] = (),
-    damage: list[str] | None = None,
-) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Read the table as ``read_table`` does, with the row numbers from before any loss."""
-    table, numbers = read_rows(stem, [] if damage is None else damage, schema.names)
-    if not table.column_names:
-        table = schema.empty_table()
-    known = [*schema, *(each for each in optional if each.name in table.column_names)]
-    missing = [
-        field.name
-        for field in known
-        if field.name not in table.column_names or table.schema.field(field.name).type != field.type
-    ]
-    if missing:
-        raise DatasetError(
-            f"the table {stem} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            f"of docs/formats.md: {_ADVICE}"
-        )
-    for field in known:
-        column = table[field.name]
-        is_list = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
-        nulls = pc.list_flatten(column).null_count if is_list else 0
-        if nulls or (column.null_count and not field.nullable):
-            raise DatasetError(f"the table {stem} holds null in {field.name}: {_ADVICE}")
-    return table, numbers

@@ -29,8 +29,8 @@ from av.error import FFmpegError
 
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import CameraImage
-from mavbridge.recording.folder import TLOG
 from mavbridge.recording.tlog import TlogFile
+from policy.data.flight_files import TLOG
 
 MAX_SLOTS = 32
 MIN_SLOTS = 4

@@ -285,21 +285,20 @@ def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
 # --- Recorded flights
 
 
-def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
+def recorded_entries(contracts: Sequence[Contract]) -> list[Entry]:
     """Draft the terms that all flights share, and ask for the terms that differ between flights.
 
     Limits go into a draft only if the flights' values differ from the defaults.
-    ``contracts`` come from the flights' ``meta.json``; missing entries have their default.
     """
-    usual = json.loads(Contract().to_json())
     entries = []
     for name in (*STICK_TERMS, *LIMIT_TERMS):
-        found = sorted({json.dumps(each.get(name, usual[name])) for each in contracts})
-        value = json.loads(found[0]) if found else usual[name]
-        if len(found) > 1:
-            why = f"the flights were flown with different ones: {', '.join(found)}"
+        values = {getattr(each, name) for each in contracts}
+        value = getattr(contracts[0], name)
+        if len(values) > 1:
+            found = ", ".join(sorted(map(json.dumps, values)))
+            why = f"the flights were flown with different ones: {found}"
             entries.append(Entry("contract", name, UNANSWERED, why))
-        elif name in STICK_TERMS or value != usual[name]:
+        elif name in STICK_TERMS or value != getattr(Contract(), name):
             entries.append(Entry("contract", name, value, "as the flights were flown"))
     return entries
 

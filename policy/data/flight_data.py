@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.contract import QUATERNION, STATE_NAMES, STICK_TERMS, Contract, FloatArray
-from policy.errors import PolicyError
+from policy.errors import DatasetError
 from policy.preprocess import STATE_SCALE
 
 Nanoseconds = NDArray[np.int64]
@@ -23,14 +23,6 @@ after it [3] m; all at the exposure, NaN if unknown."""
 
 MAX_STATE_SCALES = 30.0
 """A state this many times its usual size has another unit: 150 m/s, or milli-g for m/s^2."""
-
-
-class DatasetError(PolicyError):
-    """Flights that cannot be learned from; the message names them and the reason."""
-
-
-class NothingToLearnError(DatasetError):
-    """Flight that adds nothing to others: it is empty or a copy, or nobody flew in it."""
 
 
 @dataclass(frozen=True, kw_only=True)

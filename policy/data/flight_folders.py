@@ -14,30 +14,26 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
-from policy.data.flight_data import (
-    GATE_DIM,
-    DatasetError,
-    FlightData,
-    Nanoseconds,
-    NothingToLearnError,
+from policy.data.flight_data import GATE_DIM, FlightData, Nanoseconds
+from policy.data.flight_files import META, TICKS, read_meta_document, video_of
+from policy.data.flight_video import decode_video, read_frames
+from policy.data.tables import (
+    EXPERT_COLUMN,
+    FRAME_COLUMNS,
+    TICK_COLUMNS,
+    TRUTH_COLUMNS,
+    read_table,
+    vectors,
 )
-from policy.data.flight_video import decode_video, with_images
-from policy.data.tables import read_rows, retyped, stamps, vectors
-from policy.errors import ContractError
-from policy.files import read_object, why_unreadable
+from policy.errors import ContractError, DatasetError, NothingToLearnError
 from policy.motion.stick_loop import StickLoop, rates_contract
 
-FORMAT, VERSION = "mavbridge-flight", 1
-
 _AGE_COLUMNS = ("woke_ns", "chunk_computed_ns", "predict_ns", "feature_captured_ns")
-_TICK_COLUMNS = (
+_TICKS = (
     *(*_AGE_COLUMNS, "sent_ns", "state", "attitude_ns", "velocity_ns"),
     *("sent", "rc_sticks", "armed", "phase", "mode"),
 )
-_FRAME_COLUMNS = ("captured_ns",)
-_INTEGERS = (*_AGE_COLUMNS, *_FRAME_COLUMNS, "sent_ns", "attitude_ns", "velocity_ns")
-_WORDS = dict.fromkeys(("phase", "mode"), pa.string())
-_TYPES = dict.fromkeys(_INTEGERS, pa.int64()) | _WORDS | {"armed": pa.bool_()}
+_FRAMES = pa.schema([FRAME_COLUMNS.field("captured_ns")])
 
 
 def find_flights(paths: Sequence[Path]) -> list[Path]:
@@ -48,11 +44,11 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
         try:
             if not path.is_dir():
                 raise DatasetError(f"{path}: no such folder")
-            inside = sorted(meta.parent for meta in path.glob("*/meta.json"))
-            flights = [path] if (path / "meta.json").is_file() else inside
+            inside = sorted(meta.parent for meta in path.glob(f"*/{META}"))
+            flights = [path] if (path / META).is_file() else inside
             if not flights:
                 raise DatasetError(
-                    f"{path}: neither a flight (it has no meta.json) nor a folder of flights; it "
+                    f"{path}: neither a flight (it has no {META}) nor a folder of flights; it "
                     f"holds {sorted(entry.name for entry in path.iterdir())[:6]}"
                 )
         except OSError as error:
@@ -68,7 +64,7 @@ def failure_of(folder: Path) -> str | None:
     process. A hit of a gate's frame counts as a failure. A policy's flight that an expert labelled
     ("dagger") is used however it ended, and one that a pilot corrected although it missed gates.
     """
-    meta = _read_meta(folder)
+    meta = read_meta_document(folder)
     outcome = meta.get("outcome")
     outcome = outcome if isinstance(outcome, dict) else {}
     source, success = meta.get("source"), meta.get("success")
@@ -87,7 +83,7 @@ def failure_of(folder: Path) -> str | None:
 
 def _is_corrected(folder: Path, meta: Mapping[str, object]) -> bool:
     try:
-        ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, [])
+        ticks = _read_ticks(folder, _TICKS, [])
         return bool(_corrections(ticks, _contract(str(folder), meta)).any())
     except DatasetError:
         return False
@@ -140,7 +136,7 @@ def read_flights(
 def _digest(folder: Path) -> bytes:
     """Return a digest of what a flight is known by; a table may be either of two files."""
     digest = hashlib.sha256()
-    for path in (*sorted(folder.glob("ticks.*")), folder / "meta.json", folder / "camera.mp4"):
+    for path in (*sorted(folder.glob(f"{TICKS}.*")), folder / META, folder / video_of(None)):
         if path.is_file():
             with suppress(OSError), path.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
@@ -155,24 +151,24 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     (``--readonly``), the pilot's. A pilot's count only in a mode of the contract: in another mode
     the same stick means something else. ``camera`` is one of several, by default the first.
     """
-    name, meta = str(folder), _read_meta(folder)
+    name, meta = str(folder), read_meta_document(folder)
     damage: list[str] = []
-    ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
+    ticks = _read_ticks(folder, _TICKS, damage)
     contract = _contract(name, meta)
     _require_learnable(name, contract)
-    course_seed = meta.get("course_seed")
-    suffix = _camera_suffix(folder, contract.cameras, camera, damage)
-    video = folder / f"camera{suffix}.mp4"
-    if not (meta.get("frames") or video.exists() or any(folder.glob(f"frames{suffix}.*"))):
-        raise NothingToLearnError(f"{folder}: it ended before its first image")
-    frames, numbers = _read_table(folder, f"frames{suffix}", _FRAME_COLUMNS, damage)
-    if not video.is_file():
-        raise DatasetError(f"{folder}: no frames: record the flight with its camera")
-    places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)
-    if not len(places):
-        raise DatasetError(why_unreadable(video, ValueError("there is no whole image in it")))
-    frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
-    tick_ns, sent_ns = _decisions(name, ticks), stamps(name, ticks, "sent_ns")
+    course_seed, count = meta.get("course_seed"), meta.get("frames")
+    chosen = _choose_camera(folder, contract.cameras, camera, damage)
+    frames = read_frames(
+        *(folder, chosen, _FRAMES),
+        optional=TRUTH_COLUMNS,
+        recorded=count if meta.get("finished") is True and isinstance(count, int) else None,
+        damage=damage,
+    )
+    if not frames.num_rows:
+        raise NothingToLearnError(
+            f"{folder}: it ended before its first image, or has lost its video"
+        )
+    tick_ns, sent_ns = _decisions(ticks), ticks["sent_ns"].to_numpy()
     state = vectors(name, ticks, "state", STATE_DIM)
     sent, target, is_target = _sticks(name, ticks, contract)
     # An action that the link refused does not fly: the one before it does.
@@ -198,18 +194,18 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
         sent=np.nan_to_num(sent[flew], nan=0.0),
         contract=contract,
         course_seed=course_seed if isinstance(course_seed, int) else None,
-        age_ns=_ages(name, ticks),
-        captured_ns=stamps(name, frames, "captured_ns"),
+        age_ns=_ages(ticks),
+        captured_ns=frames["captured_ns"].to_numpy(),
         gate=_gates(name, frames),
-        decode=partial(decode_video, video, numbers),
+        decode=partial(decode_video, folder / video_of(chosen), frames.num_rows),
         damage=tuple(damage),
     )
 
 
-def _camera_suffix(
+def _choose_camera(
     folder: Path, cameras: Sequence[str], camera: str | None, damage: list[str]
-) -> str:
-    """Return the end of the names of a camera's files; note in ``damage`` what is not read."""
+) -> str | None:
+    """Return the camera to read, None for the first; note in ``damage`` what is not read."""
     first, *others = cameras
     if camera is None:
         damage += [
@@ -219,7 +215,7 @@ def _camera_suffix(
         damage.append(f"{folder}: it has no camera {camera}: its only one, {first}, is read")
     elif camera not in cameras:
         raise DatasetError(f"{folder}: no camera {camera}; it has {list(cameras)}")
-    return f"_{camera}" if camera in others else ""
+    return camera if camera in others else None
 
 
 def _sticks(
@@ -278,22 +274,11 @@ def _corrections(ticks: pa.Table, contract: Contract) -> NDArray[np.bool_]:
 
 def read_ages(folder: Path) -> Nanoseconds:
     """Return the sorted image ages that were measured at the decisions of a flight."""
-    _read_meta(folder)
-    ages = _ages(str(folder), _read_table(folder, "ticks", _AGE_COLUMNS, [])[0])
+    read_meta_document(folder)
+    ages = _ages(_read_ticks(folder, _AGE_COLUMNS, []))
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
-
-
-def _read_meta(folder: Path) -> dict[str, object]:
-    data = read_object(folder / "meta.json", DatasetError, "flight folder")
-    if data.get("format") != FORMAT:
-        raise DatasetError(f"{folder}: not a flight of mavbridge (meta.json has no {FORMAT!r})")
-    if data.get("version") != VERSION:
-        raise DatasetError(
-            f"{folder}: flight format version {data.get('version')}, this build reads {VERSION}"
-        )
-    return data
 
 
 def _contract(name: str, meta: Mapping[str, object]) -> Contract:
@@ -324,17 +309,12 @@ def _require_learnable(name: str, contract: Contract) -> None:
         )
 
 
-def _read_table(
-    folder: Path, stem: str, columns: tuple[str, ...], damage: list[str]
-) -> tuple[pa.Table, NDArray[np.int64]]:
-    table, numbers = read_rows(folder / stem, damage, columns)
-    if table.num_rows == 0:  # perhaps killed before its first rows
-        raise NothingToLearnError(f"{folder}: no {stem} were recorded")
-    if missing := [name for name in columns if name not in table.column_names]:
-        raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
-    for column in filter(_TYPES.__contains__, columns):
-        table = retyped(f"{folder}, {stem}", table, column, _TYPES[column])
-    return table, numbers
+def _read_ticks(folder: Path, names: Sequence[str], damage: list[str]) -> pa.Table:
+    schema = pa.schema([TICK_COLUMNS.field(name) for name in names])
+    ticks = read_table(folder / TICKS, schema, optional=[EXPERT_COLUMN], damage=damage)
+    if ticks.num_rows == 0:  # perhaps killed before its first rows
+        raise NothingToLearnError(f"{folder}: no ticks were recorded")
+    return ticks
 
 
 def _stamps_or(
@@ -345,20 +325,19 @@ def _stamps_or(
     return np.where(use, own, otherwise)
 
 
-def _decisions(name: str, ticks: pa.Table) -> Nanoseconds:
+def _decisions(ticks: pa.Table) -> Nanoseconds:
     """Return when the solve behind each tick began, by its inputs; the tick's time without one.
 
     A tick without a solve counts as no later than the decisions after it.
     """
-    woke_ns = pa.array(stamps(name, ticks, "woke_ns"))
     began_ns = pc.subtract(ticks["chunk_computed_ns"], ticks["predict_ns"])
-    at_ns: Nanoseconds = pc.coalesce(began_ns, woke_ns).to_numpy()
+    at_ns: Nanoseconds = pc.coalesce(began_ns, ticks["woke_ns"]).to_numpy()
     return np.minimum.accumulate(at_ns[::-1])[::-1]
 
 
-def _ages(name: str, ticks: pa.Table) -> Nanoseconds:
+def _ages(ticks: pa.Table) -> Nanoseconds:
     """Return the image's age at the decision behind each tick that had one."""
-    at_ns = pa.array(_decisions(name, ticks))
+    at_ns = pa.array(_decisions(ticks))
     ages: Nanoseconds = pc.subtract(at_ns, ticks["feature_captured_ns"]).drop_null().to_numpy()
     return ages
 
@@ -372,8 +351,7 @@ def _gates(name: str, frames: pa.Table) -> FloatArray:
     if "gate_body_m" in frames.column_names:
         out[:, :3] = vectors(name, frames, "gate_body_m", 3)
     if "gate_yaw_rad" in frames.column_names:
-        yaw_rad = retyped(name, frames, "gate_yaw_rad", pa.float64())["gate_yaw_rad"]
-        out[:, 3] = yaw_rad.to_numpy()  # null is NaN
+        out[:, 3] = frames["gate_yaw_rad"].to_numpy()  # null is NaN
     if "gate_after_body_m" in frames.column_names:
         out[:, 4:] = vectors(name, frames, "gate_after_body_m", 3)
     return out

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.data.flight_data import DatasetError, FlightData, ImageArray
+from policy.data.flight_data import FlightData, ImageArray
+from policy.errors import DatasetError
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30

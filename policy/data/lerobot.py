@@ -28,10 +28,10 @@ from policy.contract import (
     StateFrame,
 )
 from policy.data import lerobot_format as names
-from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
+from policy.data.flight_data import GATE_DIM, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
 from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
-from policy.errors import ContractError
+from policy.errors import ContractError, DatasetError
 from policy.files import (
     CONTRACT_FILE,
     UNANSWERED,

@@ -25,8 +25,9 @@ from policy.contract import (
     FloatArray,
     history_ages_ns,
 )
-from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
+from policy.data.flight_data import GATE_DIM, FlightData, Nanoseconds
 from policy.data.interpolation import MAX_GAP_NS, Indices, Interpolator, covered, nearest
+from policy.errors import DatasetError
 from policy.motion.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000

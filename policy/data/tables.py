@@ -1,41 +1,88 @@
-"""Reading of JSON and Arrow columns; faults are raised as ``DatasetError``."""
+"""Columns of a flight's tables, and the reading of Arrow columns; faults are ``DatasetError``."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from policy.contract import FloatArray
-from policy.data.flight_data import DatasetError, Nanoseconds
+from policy.contract import ACTION_DIM, STATE_DIM, FloatArray
+from policy.data.flight_data import Nanoseconds
+from policy.data.flight_files import table_file
+from policy.errors import DatasetError
 from policy.files import why_unreadable
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
+_DAMAGED = (pa.ArrowException, OSError)
+_STICKS = pa.list_(pa.float32(), ACTION_DIM)
+_VECTOR = pa.list_(pa.float32(), 3)
+STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
+TRACE_STAGES = ("raw", "clipped", "slewed", "smoothed")
 
-_LABELS = (
-    *("expert", "position_ned_m", "ned_from_body_wxyz", "velocity_ned_mps", "next_gate"),
-    *("gate_body_m", "gate_yaw_rad", "gate_after_body_m"),
+
+def columns(kind: pa.DataType, *names: str, nullable: bool = True) -> list[pa.Field]:
+    """Return fields of one type."""
+    return [pa.field(name, kind, nullable=nullable) for name in names]
+
+
+TICK_COLUMNS = pa.schema(
+    [
+        *columns(pa.int64(), "index", "due_ns", "woke_ns", "sent_ns", nullable=False),
+        pa.field("missed_slots", pa.int32(), nullable=False),
+        *columns(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
+        pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
+        *columns(pa.int64(), *STATE_STAMPS),
+        *columns(_STICKS, *TRACE_STAGES, "sent", "rc_sticks"),
+        pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
+        *columns(pa.string(), "release_reason", "release_code", "release_data", "mode"),
+        pa.field("armed", pa.bool_(), nullable=False),
+        pa.field("texts", pa.list_(pa.string()), nullable=False),
+        pa.field("dropped_before", pa.int32(), nullable=False),
+        *columns(pa.bool_(), "is_slot", "is_coasting", nullable=False),
+        *columns(pa.int64(), "chunk_serial", "chunk_computed_ns"),
+        pa.field("phase", pa.string()),
+        pa.field("position_ned_m", _VECTOR),
+        pa.field("decided_ns", pa.int64()),
+    ]
 )
-"""Columns that only demonstrations have."""
+EXPERT_COLUMN = pa.field("expert", _STICKS)
+"""Of ticks, in demonstrations only."""
+FRAME_COLUMNS = pa.schema(
+    [
+        *columns(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False),
+        pa.field("dropped_before", pa.int32(), nullable=False),
+    ]
+)
+TRUTH_COLUMNS = (
+    pa.field("position_ned_m", _VECTOR),
+    pa.field("ned_from_body_wxyz", pa.list_(pa.float32(), 4)),
+    pa.field("velocity_ned_mps", _VECTOR),
+    pa.field("next_gate", pa.int32()),
+    pa.field("gate_body_m", _VECTOR),
+    pa.field("gate_yaw_rad", pa.float32()),
+    pa.field("gate_after_body_m", _VECTOR),
+)
+"""Of frames, in demonstrations only: all null if the truth was not given; otherwise its pose, the
+first three, is never null."""
 
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
     """Return a column of integers without nulls."""
-    return number_column(name, retyped(name, table, column, pa.int64()), column).copy()
+    values = retyped(name, column, table[column], pa.int64())
+    return number_column(name, pa.table({column: values}), column).copy()
 
 
-def retyped(name: str, table: pa.Table, column: str, kind: pa.DataType) -> pa.Table:
-    """Return the table with a column of this type; raise DatasetError if a value does not fit."""
+def retyped(name: str, column: str, values: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
+    """Return a column in this type; raise DatasetError if a value does not fit."""
     try:
-        values = table[column].cast(kind)
+        return values.cast(kind)
     except pa.ArrowException as error:
-        kinds = f"{kind}, not {table[column].type}"
-        raise DatasetError(f"{name}: {column} must hold {kinds} ({error})") from error
-    return table.set_column(table.column_names.index(column), column, values)
+        raise DatasetError(
+            f"{name}: {column} must hold {kind}, not {values.type} ({error})"
+        ) from error
 
 
 def number_column(name: str, table: pa.Table, column: str) -> np.ndarray:
@@ -70,83 +117,96 @@ def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
     return out
 
 
-def read_rows(
-    stem: Path, damage: list[str], columns: Sequence[str]
-) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Read a table of a flight, complete or not; sentences about lost rows go to ``damage``.
+def read_table(
+    stem: Path,
+    schema: pa.Schema,
+    *,
+    optional: Iterable[pa.Field] = (),
+    damage: list[str] | None = None,
+) -> pa.Table:
+    """Read a table of a flight, complete or cut off, up to any damage.
 
-    A complete table is read in these ``columns`` and those of demonstrations, where it has them:
-    a stranger's other columns could have any size.
-
-    Returns:
-        The readable rows and their indices; for an empty file, no columns.
+    The columns are those of ``schema``, converted to its types, and those of ``optional`` that are
+    there: a stranger's other columns could have any size. A sentence about lost rows goes to
+    ``damage``.
 
     Raises:
-        DatasetError: there is no such table, none of it can be read, or it has more rows than a
-            flight can have.
+        DatasetError: there is no such table, none of it can be read, it has more rows than a flight
+            can have, lacks a column, or holds a value that does not belong there.
     """
-    parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
-    path = parquet if parquet.exists() else stream
+    path, fields = table_file(stem), [*schema, *optional]
+    damage = [] if damage is None else damage
     try:
-        if path == stream:
-            table, numbers = _read_batches(path, damage)
+        if path.suffix == ".parquet":
+            table = _read_parquet(path, [field.name for field in fields], damage)
         else:
-            table, numbers = _read_groups(path, damage, (*columns, *_LABELS))
+            table = _read_stream(path, damage)
     except FileNotFoundError as error:
         raise DatasetError(
-            f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
+            f"{stem.parent} has neither {stem.name}.parquet nor {path.name}: it is no whole flight"
         ) from error
-    except (pa.ArrowException, OSError) as error:
+    except _DAMAGED as error:
         raise DatasetError(why_unreadable(path, error)) from error
-    if len(set(table.column_names)) < table.num_columns:
+    has = table.column_names
+    if len(set(has)) < len(has):
         raise DatasetError(f"{path} has two columns of one name: record or convert it again")
-    return table, numbers
+    if not has:  # killed before the first batch
+        return schema.empty_table()
+    if missing := [name for name in schema.names if name not in has]:
+        raise DatasetError(
+            f"the table {path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
+            "of docs/formats.md: another program or version wrote it"
+        )
+    return pa.table({f.name: _column(path, table[f.name], f) for f in fields if f.name in has})
 
 
-def _read_batches(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+def _column(path: Path, values: pa.ChunkedArray, field: pa.Field) -> pa.ChunkedArray:
+    values = retyped(str(path), field.name, values, field.type)
+    is_list = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
+    nulls = pc.list_flatten(values).null_count if is_list else 0
+    if nulls or (values.null_count and not field.nullable):
+        raise DatasetError(
+            f"the table {path} holds null in {field.name}: another program or version wrote it"
+        )
+    return values
+
+
+def _require_possible(path: Path, rows: int) -> None:
+    if rows > MAX_ROWS:
+        raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")
+
+
+def _read_stream(path: Path, damage: list[str]) -> pa.Table:
     """Read the complete batches of a stream that still grew, or was cut off."""
     batches, rows, end, size = [], 0, 0, path.stat().st_size
-    if size == 0:  # killed before the first batch
-        return pa.table({}), np.zeros(0, np.int64)
+    if size == 0:
+        return pa.table({})
     with path.open("rb") as file, pa.ipc.open_stream(file) as reader:
         try:
             while True:
                 end = file.tell()
                 batches.append(reader.read_next_batch())
                 rows += batches[-1].num_rows
-                if rows > MAX_ROWS:
-                    raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")
+                _require_possible(path, rows)
         except StopIteration:
-            end = size
-        except (pa.ArrowException, OSError):
+            pass
+        except _DAMAGED:
             damage.append(f"{path} is damaged or cut off: its last {size - end} bytes were skipped")
-        table = pa.Table.from_batches(batches, schema=reader.schema)
-    return table, np.arange(table.num_rows)
+        return pa.Table.from_batches(batches, schema=reader.schema)
 
 
-def _read_groups(
-    path: Path, damage: list[str], columns: Sequence[str]
-) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Read the undamaged row groups of a Parquet file."""
-    groups, numbers, count = [], [np.zeros(0, np.int64)], 0
-    failure: Exception | None = None
+def _read_parquet(path: Path, names: list[str], damage: list[str]) -> pa.Table:
+    """Read the columns that a Parquet file has of these, up to its first damaged row group."""
+    groups: list[pa.Table] = []
     with path.open("rb") as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
-        if file.metadata.num_rows > MAX_ROWS:
-            rows = file.metadata.num_rows
-            raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")
-        schema = file.schema_arrow
-        for index in range(file.num_row_groups):
-            rows = file.metadata.row_group(index).num_rows
-            try:
-                groups.append(file.read_row_group(index, columns))
-                numbers.append(np.arange(count, count + groups[-1].num_rows))
-            except (pa.ArrowException, OSError) as error:
-                failure = error
-            count += rows
-    if failure is not None:
-        if not groups:
-            raise failure
-        lost = count - sum(map(len, numbers))
-        damage.append(f"{path} is damaged: {lost} of {count} rows were skipped")
-    table = pa.concat_tables(groups) if groups else schema.empty_table()
-    return table, np.concatenate(numbers)
+        rows = file.metadata.num_rows
+        _require_possible(path, rows)
+        try:
+            for index in range(file.num_row_groups):
+                groups.append(file.read_row_group(index, names))
+        except _DAMAGED:
+            if not groups:
+                raise
+            lost = rows - sum(group.num_rows for group in groups)
+            damage.append(f"{path} is damaged: its last {lost} of {rows} rows were skipped")
+        return pa.concat_tables(groups) if groups else file.schema_arrow.empty_table()

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, NS_PER_S, QUATERNION, STATE_DIM, VELOCITY, FloatArray
-from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, nearest
+from policy.errors import DatasetError
 
 TOLERANCE = 0.25
 """Largest distance of a frame from its nominal time in a window, relative to the time between two

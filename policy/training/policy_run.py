@@ -12,11 +12,11 @@ from torch.optim.swa_utils import update_bn
 
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import FLIGHT_TERMS
-from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
+from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
-from policy.errors import PolicyError
+from policy.errors import DatasetError, PolicyError
 from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import (
     ENCODE_BATCH,

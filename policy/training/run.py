@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.data.flight_data import DatasetError, FlightData, hold_out
+from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.data.interpolation import Indices
-from policy.errors import PolicyError
+from policy.errors import DatasetError, PolicyError
 from policy.training.batches import ENCODE_BATCH, FeatureStore, StepLoss, TensorBatch, ahead
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor

@@ -1,6 +1,7 @@
 """Flights to record: images that show their number, a meta, and a writer without a process."""
 
 import os
+import re
 import resource
 import signal
 from collections.abc import Iterable, Iterator
@@ -20,7 +21,7 @@ from mavbridge.recording.folder import FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.video_process import FragmentedMp4, VideoJob
 from policy.contract import Contract
-from policy.data.flight_video import decode_images, video_parts
+from policy.data.flight_video import decode_images, whole_images
 
 _BITS = 12
 _BLOCK = 16
@@ -44,12 +45,19 @@ def number_of(rgb: ImageArray) -> int:
 
 
 def count_frames(path: Path) -> int:
-    return len(video_parts(path).fragments)
+    return whole_images(path)[0]
+
+
+def fragment(data: bytes | bytearray, number: int) -> tuple[int, int]:
+    """Return start and end of an image's boxes, from 0, in the bytes of a video."""
+    starts = [found.start() - 4 for found in re.finditer(b"moof....mfhd", data, re.DOTALL)]
+    end = [*starts, bytes(data).rfind(b"mfra") - 4][number + 1]
+    return starts[number], end
 
 
 def read_video(path: Path) -> Iterator[CameraImage]:
     """Return all decodable images of a video."""
-    return decode_images(path, [fragment.number for fragment in video_parts(path).fragments])
+    return decode_images(path, count_frames(path))
 
 
 def make_frame(number: int, **changes: Any) -> VisionTick:

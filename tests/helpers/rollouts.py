@@ -28,9 +28,9 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import FloatArray, ImageArray, Tick, VisionTick
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.folder import FlightMeta
-from mavbridge.recording.tables import read_table
 from mavbridge.simulation.clock import SteppedClock
 from policy.contract import Contract
+from policy.data.tables import read_table
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner

@@ -22,12 +22,10 @@ from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import read_meta
-from mavbridge.recording.rows import TICKS
-from mavbridge.recording.tables import read_table
 from mavbridge.simulation.replay.recording import open_source
 from policy.adapters.interface import read_interface
 from policy.checkpoints.header import read_contract
-from policy.data.tables import MAX_ROWS
+from policy.data.tables import MAX_ROWS, TICK_COLUMNS, read_table
 from policy.errors import PolicyError
 from sitl.camera.shm import FramePublisher
 
@@ -203,4 +201,4 @@ def test_a_column_that_nobody_asked_for_is_not_read(tmp_path: Path) -> None:
     ticks = pq.read_table(FLIGHT / "ticks.parquet")
     wide = ticks.append_column("wide", pa.repeat(pa.scalar("x" * 1000), ticks.num_rows))
     pq.write_table(wide, tmp_path / "ticks.parquet", compression="zstd")
-    assert read_table(tmp_path / "ticks", TICKS).column_names == TICKS.names
+    assert read_table(tmp_path / "ticks", TICK_COLUMNS).column_names == TICK_COLUMNS.names

@@ -18,7 +18,7 @@ from helpers.camera_senders import (
 from helpers.status import printed_by
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.recording.flight_folder import open_flight
-from policy.data.flight_data import DatasetError
+from policy.errors import DatasetError
 from sitl.camera.shm import FramePublisher
 
 FLY = ("--dual-rate", "--mode", "ALT_HOLD", "--arm")

@@ -26,11 +26,11 @@ from mavbridge.observe.terminal import BAD, POOR, Finding, findings, number, rat
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording import replay_files
 from mavbridge.recording.flight_folder import RecordedFlight, open_cameras
-from mavbridge.recording.folder import PACKETS, SOLVES
 from mavbridge.recording.replay_files import read_settings
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.tables import read_table, table_exists
 from policy.contract import Contract
+from policy.data.flight_files import PACKETS, SOLVES, table_file
+from policy.data.tables import read_table
 
 FloatColumn: TypeAlias = NDArray[np.float64]
 ATTITUDES = (30, 31)
@@ -271,7 +271,7 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
     A sentence about any loss is appended to ``damage``.
     """
-    if not table_exists(folder / PACKETS):
+    if not table_file(folder / PACKETS).exists():
         return None
     try:
         table = read_table(folder / PACKETS, replay_files.PACKETS, damage=damage)
@@ -288,7 +288,7 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
 def recorded_solves(flight: RecordedFlight) -> Iterator[Solve]:
     """Return the policy's solves in the order of time; nothing if they were not recorded."""
-    if table_exists(stem := flight.folder / SOLVES):
+    if table_file(stem := flight.folder / SOLVES).exists():
         table = read_table(stem, replay_files.SOLVES)
         yield from replay_files.read_solves(table, flight.meta.contract)
 

@@ -12,9 +12,10 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import Action, ActionTrace
-from mavbridge.recording.rows import STATE_STAMPS, attributes
+from mavbridge.recording.rows import attributes
 from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
+from policy.data.tables import STATE_STAMPS
 
 Array: TypeAlias = NDArray[np.float64]
 PAST_INPUTS = ("states", "history", "moments")

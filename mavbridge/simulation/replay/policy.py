@@ -27,10 +27,10 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.wire import GuardStatus, Samples
 from mavbridge.mavlink.session.telemetry import samples_of
-from mavbridge.recording.rows import STATE_STAMPS
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
 from mavbridge.simulation.replay.recording import ReplaySource
+from policy.data.tables import STATE_STAMPS
 from policy.protocol import PolicyRunner
 
 

@@ -12,17 +12,8 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.tlog import read_tlog
-from mavbridge.recording import replay_files, rows
-from mavbridge.recording.folder import (
-    FEATURES,
-    PACKETS,
-    SOLVES,
-    TICKS,
-    TLOG,
-    FlightMeta,
-    of_camera,
-    read_meta,
-)
+from mavbridge.recording import replay_files
+from mavbridge.recording.folder import FlightMeta, read_meta
 from mavbridge.recording.replay_files import (
     PacketStamp,
     packet_key,
@@ -31,9 +22,10 @@ from mavbridge.recording.replay_files import (
     read_settings,
     read_solves,
 )
-from mavbridge.recording.rows import TickRow
-from mavbridge.recording.tables import read_table
+from mavbridge.recording.rows import TickRow, read_ticks
 from policy.contract import Contract
+from policy.data.flight_files import FEATURES, PACKETS, SOLVES, TICKS, TLOG, of_camera
+from policy.data.tables import TICK_COLUMNS, read_table
 from policy.files import why_unreadable
 
 STAMP_NS = 10 * NS_PER_MS
@@ -146,11 +138,11 @@ def _rows(
     folder: Path, meta: FlightMeta, damage: list[str]
 ) -> tuple[list[TickRow], list[Solve], int]:
     """Read ticks, solves and the number of lost solves; raise UserError without ticks or solves."""
-    table = read_table(folder / TICKS, rows.TICKS, damage=damage)
-    ticks = list(rows.read_ticks(table, meta.contract.action))
+    table = read_table(folder / TICKS, TICK_COLUMNS, damage=damage)
+    ticks = list(read_ticks(table, meta.contract.action))
     table = read_table(folder / SOLVES, replay_files.SOLVES, damage=damage)
     solves = list(read_solves(table, meta.contract))
-    if ticks and solves and not meta.finished:  # cut off: the last of either lack their inputs
+    if ticks and solves and (damage or not meta.finished):  # the last of either lack their inputs
         newest, count = solves[-1].serial, len(ticks)
         ticks = list(takewhile(lambda row: (row.tick.chunk_serial or 0) <= newest, ticks))
         if count > len(ticks):

@@ -6,7 +6,6 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
@@ -15,10 +14,11 @@ from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay import replay
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError
-from mavbridge.recording.folder import SETTINGS, FlightError, read_meta
-from policy.data.flight_data import DatasetError
+from mavbridge.recording.folder import read_meta
+from policy.data.flight_files import SETTINGS
 from policy.data.flight_video import decode_video
 from policy.data.lerobot import read_dataset
+from policy.errors import DatasetError
 from policy.files import read_toml
 
 ROOT = Path(__file__).parents[3]
@@ -95,7 +95,7 @@ def test_the_policy_of_the_flight_named_once_more_is_no_other_one(
 def test_a_recording_that_would_block_its_reader_is_refused(tmp_path: Path) -> None:
     folder = copied("numpy_px4", tmp_path)
     os.mkfifo(folder / "flight.rrd")
-    with pytest.raises(FlightError, match=r"flight.rrd is neither a file nor a folder"):
+    with pytest.raises(DatasetError, match=r"flight.rrd is neither a file nor a folder"):
         read_meta(folder)
 
 
@@ -110,7 +110,7 @@ def test_a_playlist_in_place_of_a_video_is_not_followed(
     }[kind]
     (tmp_path / "camera.mp4").write_text(text)
     with pytest.raises(DatasetError, match="cannot be read"):
-        list(decode_video(tmp_path / "camera.mp4", np.arange(3)))
+        list(decode_video(tmp_path / "camera.mp4", 3))
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,10 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, ImageArray, Tick, VisionTick
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import FlightError, prepare_folder, read_meta, write_meta
+from mavbridge.recording.folder import prepare_folder, read_meta, write_meta
 from mavbridge.recording.video_writer import WriterError
 from policy.contract import Contract
+from policy.errors import DatasetError
 
 
 def events(*, ticks: int = 30, frames: int = 10) -> list[Tick | VisionTick]:
@@ -81,7 +82,7 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
         *("camera.mp4", "camera_down.mp4", "frames.parquet", "frames_down.parquet"),
         *("meta.json", "ticks.parquet"),
     ]
-    with pytest.raises(FlightError, match="has no camera left: it has front, down"):
+    with pytest.raises(DatasetError, match="has no camera left: it has front, down"):
         open_flight(folder, "left")
 
 

@@ -15,7 +15,6 @@ from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import flight_writer, replay_files
 from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.folder import SETTINGS, FlightError
 from mavbridge.recording.replay_files import (
     ReplaySettings,
     packet_key,
@@ -25,8 +24,10 @@ from mavbridge.recording.replay_files import (
     read_solves,
     write_settings,
 )
-from mavbridge.recording.tables import read_table
 from policy.contract import Contract
+from policy.data.flight_files import SETTINGS
+from policy.data.tables import read_table
+from policy.errors import DatasetError
 
 CONTRACT = Contract()
 FROZEN = because(Code.IMAGE_FROZEN, age_s=0.6)
@@ -154,8 +155,8 @@ def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Pat
         '{"wall_offset_ns": 1, "config": {"link": {"output": "flags"}}}',
     ):
         (tmp_path / SETTINGS).write_text(damaged)
-        with pytest.raises(FlightError, match="damaged"):
+        with pytest.raises(DatasetError, match="damaged"):
             read_settings(tmp_path)
     (tmp_path / SETTINGS).unlink()
-    with pytest.raises(FlightError, match="older mavbridge"):
+    with pytest.raises(DatasetError, match="older mavbridge"):
         read_settings(tmp_path)

@@ -17,7 +17,7 @@ from mavbridge.recording.rows import (
     FrameTruth,
     TickRow,
     frame_columns,
-    read_frames,
+    read_frame_rows,
     read_ticks,
     tick_columns,
 )
@@ -110,7 +110,7 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
 @given(st.lists(frame_rows, max_size=8))
 def test_frames_come_back_as_they_were(rows: list[FrameRow]) -> None:
     table = pa.Table.from_pylist([*map(frame_columns, rows)], DEMONSTRATION_FRAMES)
-    assert list(read_frames(table)) == rows
+    assert list(read_frame_rows(table)) == rows
 
 
 def test_the_columns_are_those_of_the_document() -> None:

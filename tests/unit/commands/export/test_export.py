@@ -29,12 +29,11 @@ from mavbridge.commands.export import export, stretches, whole_or_nothing
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data import lerobot_format as names
-from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight
 from policy.data.lerobot import read_dataset
 from policy.data.lerobot_format import STATE_KEY
 from policy.data.tables import vectors
-from policy.errors import ContractError
+from policy.errors import ContractError, DatasetError
 from policy.preprocess import resize
 
 START = 10**9

@@ -21,8 +21,8 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.recording.folder import SETTINGS
 from mavbridge.simulation.replay.recording import open_source
+from policy.data.flight_files import SETTINGS
 from policy.errors import NoChunkError
 
 NUMPY = FLIGHTS / "numpy_px4"

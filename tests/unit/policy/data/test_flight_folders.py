@@ -11,7 +11,7 @@ import pytest
 
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from policy.contract import Contract
-from policy.data.flight_data import DatasetError, hold_out
+from policy.data.flight_data import hold_out
 from policy.data.flight_folders import (
     failure_of,
     find_flights,
@@ -20,6 +20,7 @@ from policy.data.flight_folders import (
     read_flight,
     read_flights,
 )
+from policy.errors import DatasetError
 
 WOKE = [0, 10 * MS, 20 * MS]
 STICK = (0.1, 0.2, 0.3, 0.4)
@@ -191,11 +192,11 @@ def test_a_flight_without_an_image_is_left_out(tmp_path: Path, frames: int | Non
         (blind / name).unlink()
     flights, notes = read_flights([blind, seen])
     assert [each.name for each in flights] == [str(seen)]
-    assert notes == [f"left out: {blind}: it ended before its first image"]
-    flight(tmp_path / "c", {"frames": 2})
+    assert notes == [f"left out: {blind}: it ended before its first image, or has lost its video"]
+    flight(tmp_path / "c", {"frames": 2, "finished": True})
     (tmp_path / "c" / "camera.mp4").unlink()
     (tmp_path / "c" / "frames.parquet").unlink()
-    with pytest.raises(DatasetError, match="no whole flight"):
+    with pytest.raises(DatasetError, match=r"lacks frames\.parquet, though 2 frames were recorded"):
         read_flights([tmp_path / "c", seen])
 
 
@@ -212,7 +213,7 @@ def test_no_flights_are_refused(tmp_path: Path) -> None:
     folder = flight(tmp_path / "a")
     assert find_flights([tmp_path, folder]) == [tmp_path.resolve(), folder.resolve()]
     (folder / "camera.mp4").unlink()
-    with pytest.raises(DatasetError, match="no frames"):
+    with pytest.raises(DatasetError, match="has lost its video"):
         read_flight(folder)
 
 
@@ -241,8 +242,8 @@ def test_by_rates_the_thrust_of_a_heavy_vehicle_is_not_imitated(tmp_path: Path) 
     ("meta", "ticks", "says"),
     [
         ("{", {}, "not JSON"),
-        ("[]", {}, "not a JSON object"),
-        ({"format": "other"}, {}, "not a flight of mavbridge"),
+        ("[]", {}, "not of a recorded flight"),
+        ({"format": "other"}, {}, "not of a recorded flight"),
         ({"version": 2}, {}, "version 2"),
         ({"contract": None}, {}, "a: the contract is not a JSON object"),
         ({"contract": {}}, {}, "a: its contract names no state_frame: write"),

@@ -8,9 +8,10 @@ import torch
 from helpers.flight_folders import write_spot_flight
 from policy.contract import Contract
 from policy.data import frames as dataset_frames
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.flight_folders import read_flight
 from policy.data.frames import shifted, store_frames
+from policy.errors import DatasetError
 from policy.preprocess import image_to_input
 from policy.training.batches import normalise_image
 

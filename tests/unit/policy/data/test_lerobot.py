@@ -16,9 +16,9 @@ import pytest
 
 from helpers.flight_folders import LEVEL, spot
 from policy.contract import ACTION_NAMES, STATE_NAMES
-from policy.data.flight_data import DatasetError
 from policy.data.lerobot import read_dataset
 from policy.data.lerobot_format import is_lerobot
+from policy.errors import DatasetError
 
 FPS, SIZE = 25, 32
 LENGTHS = (12, 8)

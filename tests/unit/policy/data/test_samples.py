@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import motion_since
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.samples import (
     BLIND_SHARE,
     FORCE_NOISE_MPS2,
@@ -22,6 +22,7 @@ from policy.data.samples import (
     Timeline,
     TrainingSamples,
 )
+from policy.errors import DatasetError
 from policy.preprocess import egocentric_columns
 
 MS = 1_000_000

@@ -7,8 +7,9 @@ import pytest
 
 from helpers.steered_flights import ACCELERATION_MPS2, MS, steered_flight
 from policy.contract import QUATERNION, VELOCITY
-from policy.data.flight_data import DatasetError, FlightData
+from policy.data.flight_data import FlightData
 from policy.data.windows import TOLERANCE, Windows, find_windows
+from policy.errors import DatasetError
 
 DT_NS = 100 * MS
 

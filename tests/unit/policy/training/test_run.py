@@ -16,11 +16,11 @@ from helpers.flight_folders import MS, spot, ticks_table, write_flight, write_sp
 from helpers.training_runs import card_of, make_hooks, weights_of
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import Contract
-from policy.data.flight_data import DatasetError, FlightData, hold_out
+from policy.data.flight_data import FlightData, hold_out
 from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
-from policy.errors import PolicyError
+from policy.errors import DatasetError, PolicyError
 from policy.nets.toge import Toge, TogeConfig
 from policy.training import batches as batches_module
 from policy.training.batches import SHARE, Batches, colour_matrix, disturb
