@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
+from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.data.flight_data import GATE_DIM, FlightData, Nanoseconds
 from policy.data.flight_files import META, TICKS, read_meta_document, video_of
 from policy.data.flight_video import decode_video, read_frames
@@ -169,7 +169,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
             f"{folder}: it ended before its first image, or has lost its video"
         )
     tick_ns, sent_ns = _decisions(ticks), ticks["sent_ns"].to_numpy()
-    state = vectors(name, ticks, "state", STATE_DIM)
+    state = vectors(name, ticks, "state")
     sent, target, is_target = _sticks(name, ticks, contract)
     # An action that the link refused does not fly: the one before it does.
     is_refused = (np.array(ticks["phase"]) == "flying") & ~_known(sent)
@@ -179,7 +179,7 @@ def read_flight(folder: Path, camera: str | None = None) -> FlightData:
     if contract.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(contract))
-        gains = loop.thrust_gains(vectors(name, ticks, "sent", ACTION_DIM)[:, 0], state)
+        gains = loop.thrust_gains(vectors(name, ticks, "sent")[:, 0], state)
         target[is_target] = loop.to_sticks(target[is_target], state[is_target], gains[is_target])
     state[~(is_target | is_target[flew])] = np.nan
     return FlightData(
@@ -224,11 +224,11 @@ def _sticks(
     """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
     sent = _sent(name, ticks, contract)
     is_expert = "expert" in ticks.column_names
-    target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
+    target = vectors(name, ticks, "expert") if is_expert else sent
     is_target = _known(target) & np.array([armed is True for armed in ticks["armed"].to_pylist()])
     is_correction = _corrections(ticks, contract)
     if not is_expert and is_correction.any():
-        sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
+        sent[is_correction] = vectors(name, ticks, "rc_sticks")[is_correction]
         target, is_target = sent, is_correction
     elif not is_expert:
         is_policys = ticks["sent"].null_count < ticks.num_rows
@@ -245,8 +245,8 @@ def _sticks(
 def _sent(name: str, ticks: pa.Table, contract: Contract) -> FloatArray:
     """Return the sent sticks, or the pilot's if none were sent; centred in a flight by rates."""
     if contract.action == "sticks":
-        sent = vectors(name, ticks, "sent", ACTION_DIM)
-        return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks", ACTION_DIM)
+        sent = vectors(name, ticks, "sent")
+        return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks")
     if "expert" not in ticks.column_names:
         raise DatasetError(
             f"{name} was flown by rates without an expert: what was sent in it may also be an "
@@ -349,9 +349,9 @@ def _known(values: FloatArray) -> NDArray[np.bool_]:
 def _gates(name: str, frames: pa.Table) -> FloatArray:
     out = np.full((frames.num_rows, GATE_DIM), np.nan, dtype=np.float32)
     if "gate_body_m" in frames.column_names:
-        out[:, :3] = vectors(name, frames, "gate_body_m", 3)
+        out[:, :3] = vectors(name, frames, "gate_body_m")
     if "gate_yaw_rad" in frames.column_names:
         out[:, 3] = frames["gate_yaw_rad"].to_numpy()  # null is NaN
     if "gate_after_body_m" in frames.column_names:
-        out[:, 4:] = vectors(name, frames, "gate_after_body_m", 3)
+        out[:, 4:] = vectors(name, frames, "gate_after_body_m")
     return out

@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from av.video.reformatter import VideoReformatter
 
@@ -30,7 +31,7 @@ from policy.contract import (
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, FlightData, ImageArray, Nanoseconds
 from policy.data.flight_video import rgb_pixels
-from policy.data.tables import MAX_ROWS, number_column, stamps, vectors
+from policy.data.tables import MAX_ROWS, columns, conform, vectors
 from policy.errors import ContractError, DatasetError
 from policy.files import (
     CONTRACT_FILE,
@@ -58,18 +59,22 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
     """
     info = _read_info(folder, camera_key)
     rows = _read_episodes(info)
-    columns = ["episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY]
-    columns += [name for name in names.STAMPS if name in info.features]
+    fields = [
+        *(_EPISODE, pa.field("timestamp", pa.float64(), nullable=False)),
+        *_vectors(len(STATE_NAMES), names.STATE_KEY),
+        *_vectors(len(ACTION_NAMES), names.ACTION_KEY),
+        *_integers(*(name for name in names.STAMPS if name in info.features)),
+    ]
     if names.SENT in info.features and names.SENT_AT in info.features:
-        columns.append(names.SENT)
+        fields += _vectors(len(ACTION_NAMES), names.SENT)
     files: dict[Path, list[_Row]] = {}
     for row in rows:
         files.setdefault(row.data, []).append(row)
     flights = []
     for path, inside in files.items():
-        table = _read_table(path, columns)
+        table = _read_table(path, fields)
         for row in inside:
-            part = _rows_of(table, row)
+            part = table.filter(pc.equal(table["episode_index"], row.episode_index))
             if part.num_rows != row.length:
                 raise DatasetError(
                     f"{row.name}: {path} holds {part.num_rows} rows of it, meta/episodes says "
@@ -201,22 +206,17 @@ def _read_episodes(info: _Info) -> list[_Row]:
     files = sorted((info.folder / "meta" / "episodes").glob("*/*.parquet"))
     if not files:
         raise DatasetError(f"{info.folder}: no meta/episodes/*/*.parquet: it is incomplete")
-    columns = ["episode_index", "length", "data/chunk_index", "data/file_index"]
+    fields = [_EPISODE, *_integers("length", "data/chunk_index", "data/file_index")]
     if info.is_video:
-        each = ("chunk_index", "file_index", "from_timestamp")
-        columns += [f"videos/{info.camera}/{name}" for name in each]
-    try:
-        table = pa.concat_tables([_read_table(file, columns, _MAX_EPISODES) for file in files])
-    except pa.ArrowException as error:
-        raise DatasetError(
-            f"{info.folder}: its meta/episodes differ in columns: {error}"
-        ) from error
+        video = f"videos/{info.camera}/"
+        fields += _integers(f"{video}chunk_index", f"{video}file_index")
+        fields.append(pa.field(f"{video}from_timestamp", pa.float64(), nullable=False))
+    table = pa.concat_tables([_read_table(file, fields, _MAX_EPISODES) for file in files])
     if not 0 < table.num_rows <= _MAX_EPISODES:
         raise DatasetError(
             f"{info.folder}: {table.num_rows} episodes in it; must be 1 to {_MAX_EPISODES}"
         )
-    where = f"{info.folder}, meta/episodes"
-    episodes, *_ = [number_column(where, table, column) for column in columns]
+    episodes = table["episode_index"].to_numpy()
     found, counts = np.unique(episodes, return_counts=True)
     if counts.max() > 1:  # it could be both trained on and held out
         raise DatasetError(
@@ -239,13 +239,12 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
                 chunk_index=values[f"{prefix}chunk_index"],
                 file_index=values[f"{prefix}file_index"],
             )
-        from_s = float(values[f"{prefix}from_timestamp"]) if info.is_video else 0.0
-        length = int(values["length"])
-        if not math.isfinite(from_s):
-            raise ValueError(f"from_timestamp {from_s}")
-    except (KeyError, IndexError, OverflowError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, ValueError) as error:
         raise DatasetError(f"{name}: meta does not say where its files are: {error!r}") from error
-    if length < 1:
+    from_s = values[f"{prefix}from_timestamp"] if info.is_video else 0.0
+    if not math.isfinite(from_s):
+        raise DatasetError(f"{name}: its from_timestamp is {from_s}: copy the dataset again")
+    if (length := values["length"]) < 1:
         raise DatasetError(f"{name}: meta/episodes says that it has {length} rows: remove it")
     for path in (data, video):
         if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(info.folder)):
@@ -257,31 +256,38 @@ def _row(info: _Info, values: Mapping[str, Any]) -> _Row:
     )
 
 
-def _read_table(path: Path, columns: Sequence[str], max_rows: int = MAX_ROWS) -> pa.Table:
+def _integers(*names: str) -> list[pa.Field]:
+    return columns(pa.int64(), *names, nullable=False)
+
+
+def _vectors(width: int, name: str) -> list[pa.Field]:
+    return columns(pa.list_(pa.float32(), width), name, nullable=False)
+
+
+(_EPISODE,) = _integers("episode_index")
+
+
+def _read_table(path: Path, fields: Sequence[pa.Field], max_rows: int = MAX_ROWS) -> pa.Table:
+    return conform(path, _read_columns(path, [field.name for field in fields], max_rows), fields)
+
+
+def _read_columns(path: Path, columns: list[str], max_rows: int = MAX_ROWS) -> pa.Table:
     try:
-        metadata = pq.read_metadata(library_name(path))
-        has = metadata.schema.to_arrow_schema().names
-        if missing := [name for name in columns if name not in has]:
-            raise DatasetError(f"{path} lacks {missing}, which meta/info.json promises")
-        if metadata.num_rows > max_rows:
-            raise DatasetError(f"{path} has {metadata.num_rows} rows, more than {max_rows}")
-        return pq.read_table(library_name(path), columns=list(columns), partitioning=None)
+        with pq.ParquetFile(library_name(path)) as file:
+            has, rows = file.schema_arrow.names, file.metadata.num_rows
+            if missing := [name for name in columns if name not in has]:
+                raise DatasetError(f"{path} lacks {missing}, which meta/info.json promises")
+            if rows > max_rows:
+                raise DatasetError(f"{path} has {rows} rows, more than {max_rows}")
+            return file.read(columns)
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is not there: copy the dataset again, whole") from error
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(why_unreadable(path, error)) from error
 
 
-def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
-    is_inside = number_column(row.name, table, "episode_index") == row.episode_index
-    try:
-        return table.filter(pa.array(is_inside))
-    except pa.ArrowException as error:  # strings where numbers should be
-        raise DatasetError(f"{row.name}: {row.data} has an unusable column: {error}") from error
-
-
 def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
-    seconds = number_column(row.name, table, "timestamp").astype(np.float64)
+    seconds = table["timestamp"].to_numpy()
     if not np.isfinite(seconds).all():
         raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
     off_s = np.abs(seconds - seconds[0] - np.arange(row.length) / info.fps)
@@ -293,17 +299,12 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
     timestamp_ns = np.round(seconds * NS_PER_S).astype(np.int64)
 
     def at(name: str) -> Nanoseconds:
-        return stamps(row.name, table, name) if name in table.column_names else timestamp_ns
-
-    def whole(name: str, width: int) -> FloatArray:
-        values = vectors(row.name, table, name, width)
-        if table[name].null_count:
-            raise DatasetError(f"{row.name}: {name} must hold {width} numbers a row")
-        return values
+        has_own = name in table.column_names
+        return np.asarray(table[name], np.int64) if has_own else timestamp_ns
 
     has_sent = names.SENT in table.column_names
-    state = whole(names.STATE_KEY, len(STATE_NAMES))
-    action = whole(names.ACTION_KEY, len(ACTION_NAMES))
+    state = vectors(row.name, table, names.STATE_KEY)
+    action = vectors(row.name, table, names.ACTION_KEY)
     return FlightData(
         name=row.name,
         contract=replace(info.contract, state_frame=_state_frame(info, row, state)),
@@ -314,7 +315,7 @@ def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
         target_ns=at(names.ACTED),
         target=action,
         sent_ns=at(names.SENT_AT if has_sent else names.ACTED),
-        sent=whole(names.SENT, len(ACTION_NAMES)) if has_sent else action,
+        sent=vectors(row.name, table, names.SENT) if has_sent else action,
         age_ns=np.array([], dtype=np.int64),
         captured_ns=at(names.CAPTURED),
         gate=np.full((row.length, GATE_DIM), np.nan, dtype=np.float32),
@@ -378,8 +379,9 @@ def _decode_video(info: _Info, row: _Row) -> Iterator[ImageArray]:
 
 def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
     """Yield the images of a table, PNG or JPEG; LeRobot's cells are ``{"bytes", "path"}``."""
-    table = _read_table(row.data, ["episode_index", info.camera])
-    for number, cell in enumerate(_rows_of(table, row)[info.camera].to_pylist()):
+    table = _read_columns(row.data, ["episode_index", info.camera])
+    cells = table[info.camera].filter(pc.equal(table["episode_index"], row.episode_index))
+    for number, cell in enumerate(cells.to_pylist()):
         encoded: Any = cell.get("bytes") if isinstance(cell, dict) else cell
         bgr = None
         with suppress(cv2.error, TypeError):  # nothing in it, too many pixels, or no bytes

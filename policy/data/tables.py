@@ -1,4 +1,4 @@
-"""Columns of a flight's tables, and the reading of Arrow columns; faults are ``DatasetError``."""
+"""Columns of a flight's tables, and reading them; faults are raised as ``DatasetError``."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,7 +9,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from policy.contract import ACTION_DIM, STATE_DIM, FloatArray
-from policy.data.flight_data import Nanoseconds
 from policy.data.flight_files import table_file
 from policy.errors import DatasetError
 from policy.files import why_unreadable
@@ -69,51 +68,14 @@ TRUTH_COLUMNS = (
 first three, is never null."""
 
 
-def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
-    """Return a column of integers without nulls."""
-    values = retyped(name, column, table[column], pa.int64())
-    return number_column(name, pa.table({column: values}), column).copy()
-
-
-def retyped(name: str, column: str, values: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
-    """Return a column in this type; raise DatasetError if a value does not fit."""
-    try:
-        return values.cast(kind)
-    except pa.ArrowException as error:
-        raise DatasetError(
-            f"{name}: {column} must hold {kind}, not {values.type} ({error})"
-        ) from error
-
-
-def number_column(name: str, table: pa.Table, column: str) -> np.ndarray:
-    """Return a column of numbers, in its own type, without nulls."""
-    values = table[column]
-    if values.null_count:
-        raise DatasetError(f"{name}: {column} is missing in {values.null_count} rows")
-    array = np.asarray(values.to_numpy())
-    if array.size and (array.ndim != 1 or array.dtype.kind not in "if"):
-        raise DatasetError(f"{name}: {column} must hold a number a row")
-    return array
-
-
-def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
-    """Return a column of lists of ``width`` finite numbers, [rows, width] float32, null as NaN."""
+def vectors(name: str, table: pa.Table, column: str) -> FloatArray:
+    """Return a column of vectors of finite numbers, [rows, width], null as NaN."""
     values = table[column].combine_chunks()
-    valid = values.is_valid().to_numpy(zero_copy_only=False).astype(bool)
-    lists = values.drop_null()
-    try:
-        widths = pc.unique(pc.list_value_length(lists)).to_pylist()
-        flat = lists.flatten().to_numpy(zero_copy_only=False).astype(np.float32)
-    except (pa.ArrowException, AttributeError, TypeError, ValueError):
-        flat = None
-    if flat is None or widths not in ([], [width]):
-        raise DatasetError(f"{name}: {column} must hold {width} numbers a row")
-    rows = flat.reshape(-1, width)
-    if (bad := np.flatnonzero(~np.isfinite(rows).all(axis=1))).size:
-        row = int(np.flatnonzero(valid)[bad[0]])
-        raise DatasetError(f"{name}: {column} holds NaN or infinity in row {row}")
-    out = np.full((table.num_rows, width), np.nan, dtype=np.float32)
-    out[valid] = rows
+    out = np.full((len(values), values.type.list_size), np.nan, dtype=np.float32)
+    valid = values.is_valid().to_numpy(zero_copy_only=False)
+    out[valid] = values.flatten().to_numpy().reshape(-1, values.type.list_size)
+    if (bad := np.flatnonzero(valid & ~np.isfinite(out).all(axis=1))).size:
+        raise DatasetError(f"{name}: {column} holds NaN or infinity in row {bad[0]}")
     return out
 
 
@@ -154,21 +116,37 @@ def read_table(
         return schema.empty_table()
     if missing := [name for name in schema.names if name not in has]:
         raise DatasetError(
-            f"the table {path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            "of docs/formats.md: another program or version wrote it"
+            f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} of "
+            "docs/formats.md: another program or version wrote it"
         )
-    return pa.table({f.name: _column(path, table[f.name], f) for f in fields if f.name in has})
+    return conform(path, table, [field for field in fields if field.name in has])
 
 
-def _column(path: Path, values: pa.ChunkedArray, field: pa.Field) -> pa.ChunkedArray:
-    values = retyped(str(path), field.name, values, field.type)
-    is_list = pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)
-    nulls = pc.list_flatten(values).null_count if is_list else 0
-    if nulls or (values.null_count and not field.nullable):
-        raise DatasetError(
-            f"the table {path} holds null in {field.name}: another program or version wrote it"
-        )
-    return values
+def conform(path: Path, table: pa.Table, fields: Iterable[pa.Field]) -> pa.Table:
+    """Return these columns of a table in their types.
+
+    Raises:
+        DatasetError: a value does not fit its type, or is null where none may be.
+    """
+    columns = {}
+    for field in fields:
+        values, kind = table[field.name], field.type
+        try:
+            values = values.cast(kind)
+        except pa.ArrowException as error:
+            is_vector = pa.types.is_fixed_size_list(kind)
+            wanted = f"{kind.list_size} numbers a row" if is_vector else str(kind)
+            raise DatasetError(
+                f"{path}: {field.name} must hold {wanted}, not {values.type} ({error})"
+            ) from error
+        is_list = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
+        nulls = pc.list_flatten(values).null_count if is_list else 0
+        if nulls or (values.null_count and not field.nullable):
+            raise DatasetError(
+                f"{path} holds null in {field.name}: another program or version wrote it"
+            )
+        columns[field.name] = values
+    return pa.table(columns)
 
 
 def _require_possible(path: Path, rows: int) -> None:

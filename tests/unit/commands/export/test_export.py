@@ -345,7 +345,7 @@ def test_a_state_in_body_axes_is_what_the_policy_gets_in_flight(tmp_path: Path) 
     (stretch,) = stretches(read_flight(folder))
     flown = interface.to_state(stretch.columns[STATE_KEY].astype(np.float32))
     (data,) = (out / "data").rglob("*.parquet")
-    kept = vectors("rows", pq.read_table(data), STATE_KEY, len(BODY_STATE_NAMES))
+    kept = vectors("rows", pq.read_table(data), STATE_KEY)
     np.testing.assert_allclose(kept, flown, atol=1e-6)
     mean = json.loads((out / "meta/stats.json").read_text())[STATE_KEY]["mean"]
     np.testing.assert_allclose(mean, flown.mean(axis=0), atol=1e-6)
