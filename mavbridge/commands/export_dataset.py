@@ -135,7 +135,8 @@ class DatasetWriter:
         self._state_names = BODY_STATE_NAMES if config.state == "body" else STATE_NAMES
         self._size: tuple[int, int] | None = None
         """Height and width of all images, even numbers; None before the first."""
-        self._tables: list[Path] = []
+        self._written: list[dict[str, NDArray[np.generic]]] = []
+        """Columns of each episode's table."""
         self._episodes: list[dict[str, Json]] = []
         self._colours = np.zeros((3, _LEVELS), np.int64)
         self.rows = 0
@@ -178,8 +179,9 @@ class DatasetWriter:
                 count += 1
         rows = self._rows({key: values[:count] for key, values in columns.items()}, count)
         table = pa.table({key: _arrow(values) for key, values in rows.items()})
-        self._tables.append(episode_file(self._folder, names.DATA, self.episodes))
-        pq.write_table(table, library_name(self._tables[-1]))
+        path = episode_file(self._folder, names.DATA, self.episodes)
+        pq.write_table(table, library_name(path))
+        self._written.append(rows)
         stats = {key: vector_stats(values) for key, values in rows.items()}
         stats[names.CAMERA_KEY] = colour_stats(colours, count)
         self._colours += colours
@@ -238,9 +240,11 @@ class DatasetWriter:
         episodes.parent.mkdir(parents=True)
         pq.write_table(_tasks(self._config.task), library_name(self._folder / names.TASKS))
         pq.write_table(pa.Table.from_pylist(self._episodes), library_name(episodes))
-        # One feature at a time, so that memory holds only one.
-        columns = (name for name in self._features() if name != names.CAMERA_KEY)
-        stats = {name: vector_stats(self._column(name)) for name in columns}
+        stats = {
+            name: vector_stats(np.concatenate([rows[name] for rows in self._written]))
+            for name in self._features()
+            if name != names.CAMERA_KEY
+        }
         stats[names.CAMERA_KEY] = colour_stats(self._colours, self.rows)
         lists: Json = {
             feature: {name: values.tolist() for name, values in found.items()}
@@ -249,14 +253,6 @@ class DatasetWriter:
         for name, document in ((names.STATS, lists), (names.INFO, self._info())):
             text = json.dumps(document, indent=4, allow_nan=False)
             (self._folder / name).write_text(text + "\n")
-
-    def _column(self, name: str) -> NDArray[np.generic]:
-        """Return one column of all episodes, [rows, D]."""
-        files = map(library_name, self._tables)
-        parts = [pq.read_table(file, columns=[name], partitioning=None) for file in files]
-        column = pa.concat_tables(parts)[name].combine_chunks()
-        values = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
-        return np.asarray(values.to_numpy()).reshape(len(column), -1)
 
     def _info(self) -> dict[str, Json]:
         return {
