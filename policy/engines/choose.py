@@ -153,24 +153,6 @@ def first_that_agrees(
     return make_torch_runner(policy, settings) if is_elsewhere else runner, notes
 
 
-def first_with_chunks(
-    expected: FloatArray, samples: ParitySamples, candidates: Sequence[Candidate]
-) -> tuple[PolicyRunner | None, tuple[str, ...]]:
-    """Return the first candidate with the expected chunks, or None; and a line per skipped one."""
-    notes: list[str] = []
-    for label, make in candidates:
-        try:
-            runner = make()
-            reason = parity_failure(expected, chunks_of_samples(runner, samples))
-        except (PolicyError, RuntimeError, TypeError) as error:
-            told = [*str(error).strip().splitlines(), "(nothing)"][0]
-            reason = f"{type(error).__name__}: {told}"
-        if reason is None:
-            return runner, tuple(notes)
-        notes.append(warned(f"engine {label} is passed over: {reason}"))
-    return None, tuple(notes)
-
-
 def fastest_like(
     reference: PolicyRunner, faster: Sequence[Candidate]
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
@@ -179,12 +161,20 @@ def fastest_like(
     expected = chunks_of_samples(reference, samples)
     if not np.array_equal(chunks_of_samples(reference, samples), expected, equal_nan=True):
         return reference, (warned(f"engine {reference.engine}: {_NOT_REPEATED}"),)
-    runner, notes = first_with_chunks(expected, samples, faster)
-    if runner is None:
-        return reference, (*notes, f"engine {reference.engine}")
-    if reference.engine == "torch":
-        return runner, (*notes, Agreed(f"engine {runner.engine}: agrees with torch"))
-    return runner, (*notes, f"engine {runner.engine}: agrees with float32")
+    notes: list[str] = []
+    for label, make in faster:
+        try:
+            runner = make()
+            reason = parity_failure(expected, chunks_of_samples(runner, samples))
+        except (PolicyError, RuntimeError, TypeError) as error:
+            told = [*str(error).strip().splitlines(), "(nothing)"][0]
+            reason = f"{type(error).__name__}: {told}"
+        if reason is None:
+            agreed = f"engine {runner.engine}: agrees with"
+            is_torch = reference.engine == "torch"
+            return runner, (*notes, Agreed(f"{agreed} torch") if is_torch else f"{agreed} float32")
+        notes.append(warned(f"engine {label} is passed over: {reason}"))
+    return reference, (*notes, f"engine {reference.engine}")
 
 
 def chunks_of_samples(runner: PolicyRunner, samples: ParitySamples) -> FloatArray:

@@ -1,11 +1,8 @@
-"""Built-in networks: TOGE at two rates, and ResNet-UNet at one.
+"""The built-in network, TOGE: at the camera's rate to the feature, the rest at the action rate.
 
-    image --backbone, projection--> feature --.
-    state [B, 13 or 20] ----------------------+--MLP--> condition --diffusion head--> chunk
-    action history [B, K, 4] --attention------'
-
-In TOGE the path to the feature runs at the camera's rate, the rest at the action rate. ResNet-UNet
-has no fast path, and takes the history as it is.
+image --backbone, projection--> feature --.
+state [B, 13 or 20] ----------------------+--MLP--> condition --diffusion head--> chunk
+action history [B, K, 4] --attention------'
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,6 +18,7 @@ from policy.nets.diffusion import SIZE_DIMS, DiffusionHead, NoiseSchedule
 from policy.nets.names import BackboneName, Size
 from policy.nets.resnet import build_backbone
 from policy.preprocess import egocentric_columns, egocentric_scale
+from policy.protocol import predict_by_pair
 
 HEADS = 4
 
@@ -195,12 +193,7 @@ class Toge(nn.Module):
         condition = self.condition(feature, self.state_encoder(state), action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
-    def predict(
-        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
-    ) -> Tensor:
-        """Sample a chunk as ``predict_fast``, from an image."""
-        feature = self.encode_visual(image)
-        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+    predict = predict_by_pair
 
     @property
     def schedule(self) -> NoiseSchedule:
