@@ -72,6 +72,8 @@ class Memory:
     released_ns: int = 0
     released_mode: str | None = None
     """Mode of ours in which the sticks were released; None if somebody or a failsafe changed it."""
+    trusts_hand: bool = False
+    """True if the release counts on the receiver's sticks to hold the vehicle."""
     owes_release: bool = False
     """True until a release has been sent; one is sent even if no sticks seem to be held."""
     stepped_ns: int | None = None
@@ -99,11 +101,14 @@ class Memory:
         return asked_ns is not None and now.now_ns - asked_ns <= LATE_NS
 
     def lost_mode(self, now: EngagementInputs) -> str | None:
-        """Return the mode of the release if PX4 has fallen into the failsafe of sticks since.
+        """Return the mode of the release if PX4 has fallen into the failsafe of sticks since, or a
+        safe mode if the released sticks do not hold the vehicle.
 
-        It reads a resting receiver every 0.3 s and misses our sticks after 0.6 s, so that it may
+        PX4 reads a resting receiver every 0.3 s and misses our sticks after 0.6 s, so that it may
         see neither for a moment. Its failsafe then ignores the pilot's sticks, and ends in RTL.
         """
+        if now.status.mode == self.released_mode and self.unheld(now) is not None:
+            return self.disengage.unheld_mode
         is_chosen = now.status.is_mode_chosen and now.status.mode != self.released_mode
         if (now.status.stick_loss_ns or 0) <= self.released_ns or is_chosen:
             return None  # a geofence, a battery, or a pilot who wants Hold
@@ -112,6 +117,17 @@ class Memory:
         is_dropped = now.status.is_failsafe and now.status.armed and now.status.mode == modes.hold
         is_recent = now.now_ns - self.released_ns <= LATE_NS and not self.settings.is_setpoint
         return self.released_mode if has_fallback and is_dropped and is_recent else None
+
+    def unheld(self, now: EngagementInputs) -> Reason | None:
+        """Return why the released sticks do not hold the vehicle, if they were to hold it.
+
+        They were moved during the flight, or had been the overrides of another station.
+        """
+        is_recent = now.now_ns - self.released_ns <= LATE_NS
+        if not (self.trusts_hand and is_recent and now.link.is_released and now.status.armed):
+            return None
+        reason = self.disengage.hand_objection(now)
+        return reason if reason is not None and reason.code is Code.THROTTLE_RESTS else None
 
     def nothing(self, _now: EngagementInputs, _cause: object) -> None:
         """nothing"""
@@ -192,6 +208,7 @@ class Memory:
             reason = because(Code.THEN, first=self.reason, then=reason)
         self.reason = reason
         self._note_release(now)
+        self.trusts_hand = False
         self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
 
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
@@ -200,6 +217,7 @@ class Memory:
         if mode is not None and mode != now.status.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
         self._note_release(now)
+        self.trusts_hand = mode is None and self.disengage.may_release
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
         """an unseen release is reported"""

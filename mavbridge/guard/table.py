@@ -237,8 +237,11 @@ def over(m: Memory, _: EngagementInputs) -> bool:
 
 def entered_late(m: Memory, now: EngagementInputs) -> Reason | None:
     """the vehicle enters a mode of ours after all, within 1.5 s of the request"""
-    is_late = m.has_asked(now) and now.status.mode != m.released_mode
-    return because(Code.ENTERED_LATE, mode=now.status.mode) if is_late else None
+    if not m.has_asked(now) or now.status.mode == m.released_mode:
+        return None
+    if (why := m.unheld(now)) is not None:
+        return because(Code.NOT_RELEASED, instead=now.status.mode, why=why)
+    return because(Code.ENTERED_LATE, mode=now.status.mode)
 
 
 # --- conditions

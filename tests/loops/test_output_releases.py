@@ -309,6 +309,35 @@ def test_unheard_sticks_are_followed_by_a_hold_and_only_by_a_pilot_whose_hand_is
     assert (Code.OVERRULED in flight.codes) is is_moved
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "is_moved", "end", "mode"),
+    [
+        ("ardupilot", True, OutputFlight.stop, "LAND"),
+        ("ardupilot", True, OutputFlight.die, "BRAKE"),
+        ("ardupilot", False, OutputFlight.die, "BRAKE"),
+        ("px4", True, OutputFlight.die, "AUTO.LOITER"),
+    ],
+)
+def test_a_release_to_a_throttle_that_has_left_the_middle_is_followed_by_a_safe_mode(
+    autopilot: AutopilotName, is_moved: bool, end: Callable[[OutputFlight], None], mode: str
+) -> None:
+    """It was moved in flight, or overrides of another station had been taken for it: the vehicle
+    met the ground at 2.5 m/s."""
+    flight = OutputFlight(autopilot, "sticks", params={} if is_moved else {"RC_OVERRIDE_TIME": 10})
+    if flight.is_px4:
+        fall_back(flight, 1500, 1500, 1500, 1500)
+    elif not is_moved:
+        flight.vehicle.set_receiver(IDLE_US)
+        flight.station(lambda m: m.rc_channels_override_encode(1, 1, *[1503] * 4, *[0] * 4))
+    flight.fly(1.2)
+    flight.vehicle.set_receiver(IDLE_US)
+    end(flight)
+    flight.run(3.0)
+    assert flight.samples[-1].mode == mode, flight.describe()
+    said = [report for report in flight.guard_port.reports if isinstance(report, str)]
+    assert f"{mode} instead of release: the receiver's throttle rests at -100 %" in said[-1]
+
+
 @pytest.mark.parametrize("down_s", [0.0, 0.9])
 def test_px4_is_held_again_after_it_has_left_our_sticks_for_an_idle_receiver(down_s: float) -> None:
     """The jump to its throttle counts as a hand, which ends the mode that holds."""
