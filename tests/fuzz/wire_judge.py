@@ -9,12 +9,12 @@ from helpers.output_flights import OutputFlight
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_S
 
-_QUIET = (*("HEARTBEAT", "TIMESYNC", "STATUSTEXT", "PARAM_REQUEST_READ", "REQUEST_DATA_STREAM"),)
+_QUIET = ("HEARTBEAT", "TIMESYNC", "STATUSTEXT", "PARAM_REQUEST_READ")
 _IGNORED, _RELEASED = 65535, 0
 _MOST_LEAN_RAD, _MOST_RATE_RADPS = math.radians(80.5), math.radians(220.5)
 _MOST_SPEED_MPS = 20.5
 _MOST_COMMANDS = 200
-"""In a second: those for a mode come every 50 ms, and each pretended reboot brings a few."""
+"""In a second: those for a mode come every 100 ms, and each pretended reboot brings a few."""
 
 
 class WireJudge:

@@ -316,11 +316,4 @@ class ParamWrite(NamedTuple):
         return self._replace(value=_REAL.unpack(_INTEGER.pack(number))[0])
 
 
-class StreamRequest(NamedTuple):
-    """REQUEST_DATA_STREAM (66), for vehicles without SET_MESSAGE_INTERVAL."""
-
-    stream: int
-    rate_hz: int
-
-
-Request: TypeAlias = CommandRequest | ParamRequest | ParamWrite | StreamRequest
+Request: TypeAlias = CommandRequest | ParamRequest | ParamWrite

@@ -32,7 +32,6 @@ from mavbridge.mavlink.codec.messages import (
     ParamWrite,
     ReceivedMessage,
     Request,
-    StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, TEXT_BYTES, UNKNOWN, UnusableError
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing
@@ -288,7 +287,7 @@ class Codec:
         return self._pack(kind, *values, _VELOCITY_MASK, *target, frame)
 
     def encode_request(self, target: Endpoint, request: Request) -> bytes:
-        """Encode COMMAND_LONG, PARAM_REQUEST_READ, PARAM_SET or REQUEST_DATA_STREAM."""
+        """Encode COMMAND_LONG, PARAM_REQUEST_READ or PARAM_SET."""
         match request:
             case CommandRequest(command, params):
                 padded = (*params, *(0.0,) * (7 - len(params)))
@@ -302,9 +301,6 @@ class Codec:
                 return self._pack(
                     dialect.MAVLink_param_set_message, value, *target, name.encode(), type_
                 )
-            case StreamRequest(stream, rate_hz):
-                kind = dialect.MAVLink_request_data_stream_message
-                return self._pack(kind, rate_hz, *target, stream, 1)
 
     def encode_timesync(self, ts1: int) -> bytes:
         """Encode a TIMESYNC request."""

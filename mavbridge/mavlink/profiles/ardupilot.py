@@ -98,24 +98,19 @@ class ArduPilot(Profile):
     refusal = "ArduPilot cannot release a MANUAL_CONTROL: use --output rc-override"
     params = _FIRST_NAMES
     target_hz = 50.0
-    stick_echo = StreamGroup(
-        ("RC_CHANNELS",), RC_CHANNELS_HZ, True, dialect.MAV_DATA_STREAM_RC_CHANNELS
-    )
+    stick_echo = StreamGroup(("RC_CHANNELS",), RC_CHANNELS_HZ, is_needed=True)
     """Shows overrides exactly."""
     hover_param = "MOT_THST_HOVER"
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
-        """See `Profile`. Legacy streams serve links on which no command is acknowledged.
-
-        The IMU is requested in floats first.
-        """
+        """See `Profile`. The IMU is requested in floats first."""
         attitude = ("ATTITUDE_QUATERNION", "ATTITUDE")
         imu = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
         late = "a takeover whose packet is lost, and a disarming, are seen up to 1 s late"
         return (
-            StreamGroup(attitude, state_hz, True, dialect.MAV_DATA_STREAM_EXTRA1),
-            StreamGroup(("LOCAL_POSITION_NED",), state_hz, True, dialect.MAV_DATA_STREAM_POSITION),
-            StreamGroup(imu, state_hz, True, dialect.MAV_DATA_STREAM_RAW_SENSORS),
+            StreamGroup(attitude, state_hz, is_needed=True),
+            StreamGroup(("LOCAL_POSITION_NED",), state_hz, is_needed=True),
+            StreamGroup(imu, state_hz, is_needed=True),
             self.stick_echo._replace(rate_hz=pilot_hz or RC_CHANNELS_HZ),
             *condition_streams("EKF_STATUS_REPORT"),
             StreamGroup(("HEARTBEAT",), HEARTBEAT_HZ, without=late),

@@ -53,9 +53,6 @@ class StreamGroup(NamedTuple):
     rate_hz: float
     is_needed: bool = False
     """False if nothing waits for it: a vehicle that does not grant it is flown without."""
-    stream: int | None = None
-    """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
-    set other messages."""
     least_hz: float | None = None
     """Rate of a message that is sent only on change, at or below which it is requested again; 0: if
     it stays away. None: the message is periodic, and a fraction of ``rate_hz`` decides."""

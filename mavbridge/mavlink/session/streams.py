@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.profile import StreamGroup
 
@@ -62,7 +62,7 @@ class _Stream:
         """Rate of the present option."""
         return self._options[self._at][1]
 
-    def request(self) -> Request:
+    def request(self) -> CommandRequest:
         """Return the next request."""
         self.attempts += 1
         self.is_denied = False
@@ -73,20 +73,21 @@ class _Stream:
         self.is_settled, self.has_settled, self.attempts = True, True, 0
         self.is_given_up = is_given_up
 
-    def refuse(self, *, is_silent: bool = False, has_answered: bool = True) -> None:
-        """Go on to the next option; after silence of a vehicle that has answered no request, to
-        REQUEST_DATA_STREAM, if there is one.
-
-        An optional group is given up, after silence until its rate is looked at.
-        """
+    def refuse(self) -> None:
+        """Go on to the next option; an optional group is given up."""
         self.attempts = 0
-        if not self.group.is_needed:
-            self.settle(is_given_up=not is_silent)
-        elif not is_silent:
+        if self.group.is_needed:
             self._at = (self._at + 1) % len(self._options)
             self.is_denied = self._at == 0
-        elif self.group.stream is not None and not has_answered:
-            self._at = len(self._options) - 1
+        else:
+            self.settle(is_given_up=True)
+
+    def miss(self, requested_ns: int) -> None:
+        """Note silence since this request. A group that comes counts as granted, an optional one
+        until its rate is looked at; a required one is requested again."""
+        self.attempts = 0
+        if self.newest_ns > requested_ns or not self.group.is_needed:
+            self.settle()
 
     def arriving_hz(self, span_s: float) -> float:
         """Return the arrival rate of the group's most frequent message."""
@@ -98,24 +99,17 @@ class _Stream:
         return self.arriving_hz(span_s) <= least_hz
 
 
-def _options(group: StreamGroup) -> list[tuple[Request, float]]:
-    """Return the requests for a group and their rates; "denied" may mean too fast or unknown.
-
-    REQUEST_DATA_STREAM comes last.
-    """
+def _options(group: StreamGroup) -> list[tuple[CommandRequest, float]]:
+    """Return the requests for a group and their rates; "denied" may mean too fast or unknown."""
     rates_hz = [group.rate_hz]
     while rates_hz[-1] / 2 >= _LOWEST_HZ:
         rates_hz.append(rates_hz[-1] / 2)
     interval = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
-    options: list[tuple[Request, float]] = [
+    return [
         (CommandRequest(interval, (IDS[name], 1e6 / rate_hz)), rate_hz)
         for name in group.messages
         for rate_hz in rates_hz
     ]
-    if group.stream is not None:
-        legacy = StreamRequest(group.stream, max(round(group.rate_hz), 1))
-        options.append((legacy, group.rate_hz))
-    return options
 
 
 class StreamRequester:
@@ -140,8 +134,6 @@ class StreamRequester:
         self._by_message: dict[str, _Stream] = {}
         self._pending: _Stream | None = None
         self._requested_ns = 0
-        self._has_answered = False
-        """True if the vehicle has granted or denied a request: then silence is a loss."""
         self._window_ns: int | None = None
         """Start of the counting window; None while requests are open."""
         self._scaled_windows = 0
@@ -186,21 +178,21 @@ class StreamRequester:
             return
         if ack.result in _UNDECIDED:
             return  # repeated as if there were no answer
-        self._pending.silences, self._has_answered = 0, True
+        self._pending.silences = 0
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.settle()
         else:
             self._pending.refuse()
         self._pending = None
 
-    def step(self, now_ns: int) -> Request | None:
+    def step(self, now_ns: int) -> CommandRequest | None:
         """Return the request that is due, or None."""
         self._check_rates(now_ns)
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
             if self._pending.attempts >= (1 if self._pending.silences else _ATTEMPTS):
-                self._pending.refuse(is_silent=True, has_answered=self._has_answered)
+                self._pending.miss(self._requested_ns)
                 if not self._pending.group.is_needed:  # the others first
                     pause_ns = min(_WATCH_NS << self._pending.silences, _PAUSE_NS)
                     self._pending.due_ns = now_ns + pause_ns
@@ -213,13 +205,9 @@ class StreamRequester:
         if self._pending is None:
             return None
         self._requested_ns = now_ns
-        request = self._pending.request()
-        if isinstance(request, StreamRequest):  # never acknowledged
-            self._pending.settle()
-            self._pending = None
-        return request
+        return self._pending.request()
 
-    def stand_ins(self, now_ns: int) -> Iterator[Request]:
+    def stand_ins(self, now_ns: int) -> Iterator[CommandRequest]:
         """Yield requests for the stand-ins of missing streams."""
         for stream in self._streams:
             name = stream.group.stand_in

@@ -38,7 +38,6 @@ from mavbridge.mavlink.codec.messages import (
     SpecificForce,
     StampOrder,
     StatusText,
-    StreamRequest,
     SystemStatus,
     Timesync,
     VelocityTarget,
@@ -353,8 +352,6 @@ def test_requests() -> None:
     written = request(ParamWrite("RC_OVERRIDE_TIME", 0.5))
     assert (written.get_type(), written.param_id) == ("PARAM_SET", "RC_OVERRIDE_TIME")
     assert (written.param_value, written.param_type) == (0.5, dialect.MAV_PARAM_TYPE_REAL32)
-    stream = request(StreamRequest(10, 50))
-    assert (stream.req_stream_id, stream.req_message_rate, stream.start_stop) == (10, 50, 1)
     timesync = sent(ours.encode_timesync(-5))
     assert (timesync.tc1, timesync.ts1) == (0, -5)  # no answer in it
 

@@ -4,7 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.messages import CommandAck, Endpoint, StreamRequest
+from mavbridge.mavlink.codec.messages import CommandAck, Endpoint
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile, StreamGroup
@@ -80,7 +80,6 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
         elif answer is not None:
             requester.receive_ack(ack(answer))
         assert requester.is_settled == (len(requested) >= 4)
-    # never the legacy request, which would change the rates of other messages as well
     attempts = 4 if answer is None else 1
     asked = [ids(request)[0] for request in requested[4:]]
     once = [number for number in (1, 245, 193, 0) for _ in range(attempts)]
@@ -104,35 +103,37 @@ def test_what_no_answer_comes_to_is_asked_for_ever_more_rarely() -> None:
     assert link.rates_hz.keys() >= set(optional)
 
 
-LEGACY = StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
 DENIED_ONCE = [(number, us) for number in (31, 30) for us in (10000, 20000, 40000)]
 
 
 @pytest.mark.parametrize(
-    ("profile", "answer", "requested", "last_s"),
+    ("answer", "comes", "requested", "last_s"),
     [
-        # slower, then another message, then the legacy stream
-        (ARDUPILOT, dialect.MAV_RESULT_DENIED, [*DENIED_ONCE, LEGACY], 0.06),
+        # slower, then another message, then from the start, after a pause
+        (dialect.MAV_RESULT_DENIED, False, [*DENIED_ONCE, (31, 10000)], 0.55),
         # undecided or unanswered: repeated without haste
-        (ARDUPILOT, dialect.MAV_RESULT_TEMPORARILY_REJECTED, [(31, 10000)] * 4 + [LEGACY], 2.0),
-        (ARDUPILOT, None, [(31, 10000)] * 4 + [LEGACY], 2.0),
-        (PX4, None, [(31, 10000)] * 10, 4.5),  # no legacy stream: for ever
+        (dialect.MAV_RESULT_TEMPORARILY_REJECTED, False, [(31, 10000)] * 10, 4.5),
+        (None, False, [(31, 10000)] * 10, 4.5),
+        # it comes without an answer, which was lost
+        (None, True, [(31, 10000)] * 4, 1.5),
     ],
 )
 def test_what_is_not_granted_is_asked_for_otherwise(
-    profile: Profile, answer: int | None, requested: list[object], last_s: float
+    answer: int | None, comes: bool, requested: list[object], last_s: float
 ) -> None:
-    requester, found, found_s = StreamRequester(profile.streams(state_hz=100)[:1]), [], []
+    requester, found, found_s = StreamRequester(PX4.streams(state_hz=100)[:1]), [], []
     for tick in range(500):
+        if comes:
+            requester.receive("ATTITUDE_QUATERNION", tick * 10 * NS_PER_MS)
         if (request := requester.step(tick * 10 * NS_PER_MS)) is not None:
-            found.append(request if isinstance(request, StreamRequest) else ids(request))
+            found.append(ids(request))
             found_s.append(tick / 100)
             if answer is not None:
                 requester.receive_ack(ack(answer))
-            if request == LEGACY:
+            if len(found) == len(requested) and not comes:
                 break
     assert (found, found_s[-1]) == (requested, last_s)
-    assert requester.is_settled is (LEGACY in requested)
+    assert requester.is_settled is comes
 
 
 @pytest.mark.parametrize(
@@ -282,7 +283,6 @@ def test_a_stream_that_comes_in_spite_of_a_denial_is_kept_coming() -> None:
 
 
 def test_a_vehicle_that_was_off_is_asked_as_before() -> None:
-    """Not by legacy streams, which would bring a dozen other messages at 100 Hz as well."""
     link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
     link.run(5.0)
     wanted = set(link.asked)
@@ -292,13 +292,6 @@ def test_a_vehicle_that_was_off_is_asked_as_before() -> None:
     link.asked.clear()
     link.run(6.0)
     assert set(link.asked) == wanted
-
-
-def test_a_vehicle_whose_answers_get_lost_is_asked_on() -> None:
-    link = Link(ARDUPILOT.streams(state_hz=100), capacity_hz=1e4)
-    link.unanswered = set(range(2, 8))
-    link.run(5.0)
-    assert link.asked[1:8] == [(IDS["LOCAL_POSITION_NED"], 100.0)] * 7
 
 
 def test_a_silence_of_the_whole_vehicle_is_told_as_no_lack_of_a_message() -> None:
