@@ -44,9 +44,7 @@ def _signals_are_heard() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """Sums of two threads differ in the last bit; and the other cores are in use, too."""
-    import torch
+    from policy.engines.torch_engines import torch_threads
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    with torch_threads(1):
+        yield

@@ -40,7 +40,6 @@ from mavbridge.commands.imagine_rollout import (
     WorldModelDecider,
     require_terms,
     rollout,
-    torch_threads,
 )
 from mavbridge.commands.output import print_warnings, progress_bar, text_console
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -57,6 +56,7 @@ from mavbridge.simulation.clock import SteppedClock
 from policy.checkpoints.networks import load_world_model
 from policy.contract import ACTION_DIM, STATE_DIM
 from policy.engines.runner import require_device
+from policy.engines.torch_engines import torch_threads
 from policy.errors import Warned
 from policy.nets.world_model.config import WorldModelConfig
 from policy.preprocess import resize

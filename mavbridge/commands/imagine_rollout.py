@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,6 +16,7 @@ from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.flight.history import SentHistory
 from policy.contract import SINCE_EXPOSURE_DIM, STICK_TERMS, Contract
+from policy.engines.torch_engines import torch_threads
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner
@@ -29,17 +29,6 @@ MAX_SEED = 2**63 - 1
 
 class RolloutError(MavbridgeError):
     """The rollout had to end; the part written so far is readable."""
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Context manager: let torch use ``count`` threads, at least one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(max(1, count))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Sampler:

@@ -3,7 +3,8 @@
 import copy
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -23,6 +24,17 @@ _COLLECTIONS = (list, tuple, set, deque)
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
 """Packages whose objects are not searched."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Context manager: let torch use ``count`` threads, at least one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, count))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.data.interpolation import Indices
+from policy.engines.torch_engines import torch_threads
 from policy.errors import DatasetError, PolicyError
 from policy.training.batches import ENCODE_BATCH, FeatureStore, StepLoss, TensorBatch, ahead
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -252,7 +253,9 @@ class TrainingRun(ABC, Generic[M, B]):
             since = 0
             while self._fraction < stage.end:
                 metrics = self._set_gradients(next(batches).to(self.device))
-                with one_thread():
+                # On cores shared with another program, threads that wait for each other in every
+                # small operator of this took a hundred times the processor time of one.
+                with torch_threads(1):
                     rate = self._step(stage, optimiser)
                 sums = {name: sums.get(name, 0.0) + value for name, value in metrics.items()}
                 since += 1
@@ -351,21 +354,6 @@ class TrainingRun(ABC, Generic[M, B]):
         record = {"step": self.step, "stage": stage.name, **facts}
         with self._log.open("a") as file:
             file.write(json.dumps(record) + "\n")
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread inside the block.
-
-    On cores shared with another program, threads that wait for each other in every small operator
-    of an optimiser's step took a hundred times the processor time of one.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def computing_in(device: torch.device, bf16: bool) -> torch.autocast:
