@@ -70,12 +70,17 @@ first three, is never null."""
 
 def vectors(name: str, table: pa.Table, column: str) -> FloatArray:
     """Return a column of vectors of finite numbers, [rows, width], null as NaN."""
-    values = table[column].combine_chunks()
-    out = np.full((len(values), values.type.list_size), np.nan, dtype=np.float32)
-    valid = values.is_valid().to_numpy(zero_copy_only=False)
-    out[valid] = values.flatten().to_numpy().reshape(-1, values.type.list_size)
-    if (bad := np.flatnonzero(valid & ~np.isfinite(out).all(axis=1))).size:
+    out = vectors_or_nan(table[column])
+    if (bad := np.flatnonzero(table[column].is_valid() & ~np.isfinite(out).all(axis=1))).size:
         raise DatasetError(f"{name}: {column} holds NaN or infinity in row {bad[0]}")
+    return out
+
+
+def vectors_or_nan(column: pa.ChunkedArray) -> FloatArray:
+    """Return a column of vectors, [rows, width], null as NaN."""
+    width = column.type.list_size
+    out = np.full((len(column), width), np.nan, dtype=np.float32)
+    out[column.is_valid().to_numpy()] = pc.list_flatten(column).to_numpy().reshape(-1, width)
     return out
 
 

@@ -32,7 +32,7 @@ from policy.contract import Contract
 from policy.data.flight_files import PACKETS, SOLVES, table_file
 from policy.data.tables import read_table
 
-FloatColumn: TypeAlias = NDArray[np.float64]
+FloatColumn: TypeAlias = NDArray[np.floating]
 ATTITUDES = (30, 31)
 """Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 

@@ -26,6 +26,7 @@ from mavbridge.observe.terminal import BAD, POOR
 from mavbridge.observe.viewer_layout import action_title
 from policy.adapters.interface import EULER_NAMES, state_values
 from policy.contract import RATE, STATE_NAMES, VELOCITY
+from policy.data.tables import vectors_or_nan
 from policy.motion.rotation import other_frame
 
 MAX_VIDEO_BYTES = 40_000_000
@@ -102,7 +103,7 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
     contract = flight.meta.contract
     yield from _action_plots(flight.ticks, contract.action)
     yield from _timing_plots(flight)
-    state = _vectors(flight.ticks["state"])
+    state = vectors_or_nan(flight.ticks["state"]).astype(np.float64)
     if contract.state_frame == "enu_flu":
         state = other_frame(state)
     angles_rad = np.stack(state_values(list(state.T), STATE_NAMES, EULER_NAMES), axis=-1)
@@ -112,16 +113,16 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
         ("Body rates", "deg/s", ("roll", "pitch", "yaw"), np.degrees(state[:, RATE])),
     ):
         yield _plot(title, unit, dict(zip(names, values.T, strict=True)))
-    height_m = -_vectors(flight.ticks["position_ned_m"])[:, 2]
+    height_m = -vectors_or_nan(flight.ticks["position_ned_m"])[:, 2]
     yield _plot("Height above the origin", "m", {"height": height_m})
 
 
 def _action_plots(ticks: pa.Table, action: ActionKind) -> Iterator[dict[str, Any]]:
     """Yield a plot for each number of the actions, from the policy to the message."""
     is_sticks = action == "sticks"
-    stages = {name: _vectors(ticks[name]) for name in ("raw", "smoothed", "sent")}
+    stages = {name: vectors_or_nan(ticks[name]) for name in ("raw", "smoothed", "sent")}
     if is_sticks:  # the echo of other actions is none of theirs
-        stages = {ECHO: _vectors(ticks["rc_sticks"])} | stages
+        stages = {ECHO: vectors_or_nan(ticks["rc_sticks"])} | stages
     for axis, name in enumerate(ACTION_CLASSES[action]._fields):
         title = f"Stick: {name}" if is_sticks else action_title(name)
         plot = _plot(title, "", {stage: values[:, axis] for stage, values in stages.items()})
@@ -152,15 +153,6 @@ def _timing_plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
         lateness = {"sticks after their slot": lateness_ms}
         missed_ms = {"missed": NS_PER_S / NS_PER_MS / flight.stick_hz}
         yield _plot("Lateness", "ms", lateness, missed_ms) | {"fromZero": True}
-
-
-def _vectors(column: pa.ChunkedArray) -> FloatColumn:
-    """Return a column of vectors as rows [N, D], NaN for null."""
-    rows = np.full((len(column), column.type.list_size), np.nan)
-    rows[column.is_valid().to_numpy()] = (
-        column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
-    )
-    return rows
 
 
 def _plot(
