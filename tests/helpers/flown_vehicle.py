@@ -40,6 +40,7 @@ class FlownVehicle:
         self.is_landed: bool | None = False
         self.has_receiver: bool | None = False
         self.is_failsafe = False
+        self.rc_channels_us: tuple[int, ...] = ()
         self.texts: list[str] = []
         self.report = self.texts.append
         self.is_known = True
@@ -54,6 +55,7 @@ class FlownVehicle:
             is_landed=self.is_landed,
             has_receiver=self.has_receiver,
             is_failsafe=self.is_failsafe,
+            rc_channels_us=self.rc_channels_us,
         )
 
 

@@ -136,6 +136,11 @@ class EchoCheck:
         value = wanted[at] + (dither if wanted[at] <= rules.centre else -dither)
         return (*wanted[:at], value, *wanted[at + 1 :])
 
+    def showed(self, values: Shown) -> None:
+        """Note the values of a message from before this check, unless one has come since."""
+        if self._baseline is None and not self.is_sending:
+            self._baseline = values
+
     def tried(self, now_ns: int) -> None:
         """Note a command, sent or not: its echo is expected from now on."""
         self._tried_ns = now_ns
@@ -202,8 +207,10 @@ class EchoCheck:
         elif not self.confirmed:
             self._baseline = before if is_ours else values
         elif before is None or not _is_within(max(rules.hand, rules.tolerance), values, before):
+            if rules.hand > 0 and before is None:
+                self._baseline = values  # perhaps a source that rests as it did before ours
             if _is_often(self._foreign_us, shown_us):
-                self._fail("foreign", now_ns)
+                self._fail("foreign", now_ns, is_hand=rules.hand > 0 and before is not None)
         elif _is_often(self._returned_us, shown_us):
             self._fail("returned", now_ns)
         if self.confirmed or is_held:
@@ -244,9 +251,8 @@ class EchoCheck:
         if held_us >= SILENT_US and self._held_samples >= SILENT_SAMPLES:
             self._fail("silent", now_ns)
 
-    def _fail(self, fault: EchoFault, now_ns: int) -> None:
+    def _fail(self, fault: EchoFault, now_ns: int, *, is_hand: bool = False) -> None:
         """Note a fault; of several in a row a hand counts, else the first, the likely cause."""
-        is_hand = fault == "foreign" and self._rules.hand > 0
         if is_hand or self._fault is None or now_ns - self._fault_ns >= _RETRY_NS:
             self._fault = fault
         self._fault_ns = now_ns

@@ -128,6 +128,8 @@ class OverrideOutput(StickOutput):
         calibration = vehicle.params.calibration
         if calibration is None:
             return None
+        if not self.echo.has_sent and (status := vehicle.status(now_ns)) and status.rc_channels_us:
+            self.echo.showed(calibration.stick_channels_us(status.rc_channels_us))
         pwm_us = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
         self._calibration, self._last = calibration, pwm_us

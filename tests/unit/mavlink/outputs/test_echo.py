@@ -131,9 +131,9 @@ class World:
             self.now_ns += MS // 2
         return fault
 
-    def engage(self) -> None:
+    def engage(self, *, after_s: float = 0.5) -> None:
         """Send until the echo is confirmed."""
-        self.run(0.5)
+        self.run(after_s)
         self.is_sending = True
         while not self.echo.confirmed:
             assert self.run(0.01) is None
@@ -260,14 +260,24 @@ def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> Non
     ],
 )
 @pytest.mark.parametrize("downlink_loss", [0.0, 1.0])
+@pytest.mark.parametrize("first", ["theirs", "ours", "ours, after an older message"])
 def test_after_sticks_that_expire_unheard_only_a_hand_on_the_receiver_counts(
-    receiver: Shown, fault: EchoFault, downlink_loss: float
+    receiver: Shown, fault: EchoFault, downlink_loss: float, first: str
 ) -> None:
-    """Else the vehicle is given back to an idle receiver, or taken from a pilot who flies it."""
-    world = engaged()
+    """Else the vehicle is given back to an idle receiver, or taken from a pilot who flies it.
+
+    ``first``: sticks that the first message after the choice of the output shows.
+    """
+    world = World()
+    if first == "ours, after an older message":
+        world.echo.showed(RECEIVER)
+    world.engage(after_s=0.5 if first == "theirs" else 0.0)
     world.is_deaf, world.loss = True, downlink_loss
     assert world.last_fault(3.0) == "silent"
-    world.override, world.receiver, world.loss = None, receiver, 0.0
+    world.override, world.loss = None, 0.0
+    if first == "ours":  # only these tell how the receiver rests
+        assert world.last_fault(0.3) == "silent"
+    world.receiver = receiver
     assert world.last_fault(4.0) == fault
     world.is_deaf = False
     assert world.last_fault(3.1) is None

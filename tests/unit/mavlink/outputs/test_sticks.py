@@ -18,7 +18,7 @@ from mavbridge.core.vehicle import (
     StickGains,
     Sticks,
 )
-from mavbridge.mavlink.codec.messages import ManualControl
+from mavbridge.mavlink.codec.messages import ManualControl, RcChannels
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.outputs.sender import choose_output
 from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
@@ -231,6 +231,26 @@ def test_no_throttle_and_yaw_of_a_policy_disarm_a_copter_in_the_air(
     sent = flight.send(Sticks(throttle, float(side), 0.0, 0.0)).action
     assert isinstance(sent, Sticks)
     assert (sent.throttle, sent.yaw) == pytest.approx((throttle, side * yaw), abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("shown_us", "code"),
+    [((1500, 1500, 1000, 1500), Code.UNHEARD), ((1500, 1500, 1600, 1500), Code.OVERRULED)],
+)
+def test_a_receiver_is_known_by_what_it_showed_before_the_output_was_chosen(
+    shown_us: tuple[int, ...], code: Code
+) -> None:
+    """With --arm, the first RC_CHANNELS that the output sees may show our sticks already."""
+    flight = copter_flight()
+    flight.vehicle.rc_channels_us = (1500, 1500, 1000, 1500)
+    for k in range(120):
+        message: Any = flight.message(flight.send(Sticks(0.3, 0.0, 0.0, 0.2)))
+        ours_us = tuple(getattr(message, f"chan{n}_raw") for n in (1, 2, 3, 4))
+        if k < 50:
+            held_us = ours_us
+        is_over = k >= 100  # RC_OVERRIDE_TIME
+        flight.receive(RcChannels(shown_us if is_over else held_us, flight.now_ns // 1000))
+    assert flight.problem.code is code
 
 
 def test_other_actions_than_sticks_are_refused() -> None:
