@@ -66,7 +66,8 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
     ):
         if stat.S_ISFIFO(mode):
             raise UserError(f"--camera {spec!r} is a named pipe: its MJPEG is 'pipe:cat {spec}'")
-        raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
+        lack = "a folder" if spec and stat.S_ISDIR(mode) else "no such file"
+        raise UserError(f"--camera {spec!r}: {lack}, and not a known source; use {FORMS}")
 
 
 def require_present(spec: str) -> None:

@@ -107,9 +107,10 @@ def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s,
     ], "a reason is told once"
 
 
-@pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "."])
+@pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "/"])
 def test_anything_else_is_refused_with_the_forms_there_are(spec):
-    with pytest.raises(UserError, match=r"no such file.*/dev/video0.*rtsp://.*shm:NAME.*screen:"):
+    lack = "a folder" if spec == "/" else "no such file"
+    with pytest.raises(UserError, match=lack + r".*/dev/video0.*rtsp://.*shm:NAME.*screen:"):
         check_camera(spec)
 
 
