@@ -90,7 +90,6 @@ class GuardProcess:
         """Error that ended the guard."""
         self.is_stuck = False
         """True if the guard stands still and was not killed."""
-        self.send(settings)
 
     @property
     def pid(self) -> int:
@@ -263,15 +262,19 @@ def _spawn(
 ) -> subprocess.Popen[bytes]:
     files = [end.fileno() for end in ends]
     passed = files + ([] if settings.tlog_fd is None else [settings.tlog_fd])
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", "mavbridge.guard", *map(str, files)],
         env=child_environment(),
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         pass_fds=passed,
         start_new_session=True,  # the terminal's signals are not for the guard
     )
+    assert process.stdin is not None
+    with suppress(BrokenPipeError), process.stdin:
+        process.stdin.write(encode(settings))
+    return process
 
 
 def start_guard(

@@ -1,11 +1,11 @@
 """Guard process: ``python -m mavbridge.guard FD FD``, started by the flight process.
 
-It prints nothing, since a reader of its output might block it. Messages and errors go through the
-channel (the first file descriptor), the vehicle's readings through the second.
+Its settings come on standard input. It prints nothing, since a reader of its output might block it.
+Messages and errors go through the channel (the first file descriptor), the vehicle's readings
+through the second.
 """
 
 import os
-import select
 import signal
 import socket
 import sys
@@ -22,7 +22,7 @@ from mavbridge.guard.values import EndRequest, GuardSettings, Outcome
 from mavbridge.guard.wire import (
     GuardDiedError,
     GuardSummary,
-    decode_to_guard,
+    decode_settings,
     encode,
 )
 from mavbridge.mavlink.codec.tlog import PacketPipe
@@ -30,7 +30,6 @@ from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
 
-SETTINGS_TIMEOUT_S = 5.0
 LAST_WORDS_S = 2.0
 """Longest wait [s] for a busy flight process to read the last message; control is given back."""
 LEAD_NS = 150 * NS_PER_MS // 1000
@@ -46,14 +45,10 @@ def main() -> None:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     ends = [socket.socket(fileno=int(fd)) for fd in sys.argv[1:]]
     port, samples = SocketPort(ends[0], peer_pid=os.getppid()), SocketPort(ends[1])
-    select.select([port], [], [], SETTINGS_TIMEOUT_S)
-    first, *later = port.receive() or [b""]
-    settings = decode_to_guard(first) if first else None
-    if not isinstance(settings, GuardSettings):
-        sys.exit("the flight process sent no settings")
+    settings = decode_settings(sys.stdin.buffer.read())
     try:
         with ExitStack() as stack:
-            _run(settings, port, samples, later, stack)
+            _run(settings, port, samples, stack)
     except MavbridgeError as error:
         kind = UserError if isinstance(error, UserError) else PeerError
         port.finish(encode(kind(str(error))), LAST_WORDS_S)
@@ -64,13 +59,7 @@ def main() -> None:
         sys.exit(2)
 
 
-def _run(
-    settings: GuardSettings,
-    port: SocketPort,
-    samples: SocketPort,
-    received: list[bytes],
-    stack: ExitStack,
-) -> None:
+def _run(settings: GuardSettings, port: SocketPort, samples: SocketPort, stack: ExitStack) -> None:
     clock, log, signing, problem = MonotonicClock(), None, None, None
     if settings.link.signing is not None:
         signing = stack.enter_context(store := SigningStore(settings.link.signing, clock))
@@ -86,7 +75,7 @@ def _run(
         keeps_packets=settings.keeps_packets,
         signing=signing,
     )
-    loop = GuardLoop(clock, link, port, samples=samples, received=received, lead_ns=LEAD_NS)
+    loop = GuardLoop(clock, link, port, samples=samples, lead_ns=LEAD_NS)
     told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     # After the link is open: the first message tells the flight process so.

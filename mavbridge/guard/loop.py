@@ -2,7 +2,7 @@
 
 import select
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
 from functools import partial
@@ -65,7 +65,6 @@ class GuardLoop:
         flight: Port,
         *,
         samples: Port | None = None,
-        received: Sequence[bytes] = (),
         lead_ns: int = 0,
         watch_input: Callable[[int, GuardInput], object] = lambda at_ns, given: None,
     ) -> None:
@@ -76,11 +75,9 @@ class GuardLoop:
             link: link to the vehicle.
             flight: channel to the flight process.
             samples: port for the vehicle's readings; None: send them through ``flight``.
-            received: messages already received from the flight process.
             lead_ns: time from the start of a computation to its slot; the send waits for the slot.
             watch_input: called with the time and the input of each step of the guard.
         """
-        self._received = list(received)
         self._watch_input = watch_input
         self._lead_ns = lead_ns
         self._clock = clock
@@ -331,8 +328,7 @@ class GuardLoop:
         chunk: Chunk | None = None
         absence: Reason | None = None
         act: OperatorCommand | None = None
-        received, self._received = [*self._received, *self._flight.receive()], []
-        for data in received:
+        for data in self._flight.receive():
             try:
                 message = decode_to_guard(data)
             except ValueError:

@@ -96,7 +96,7 @@ class GuardSummary:
     """Packets dropped because the telemetry log's pipe was full."""
 
 
-ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | Reason | OperatorCommand | EndRequest
+ToGuard: TypeAlias = FlightSettings | Chunk | Reason | OperatorCommand | EndRequest
 """A reason tells why the flight process cannot compute a chunk now."""
 FromGuard: TypeAlias = (
     Samples
@@ -112,14 +112,20 @@ FromGuard: TypeAlias = (
 )
 """Text is one line for the user; an error ends the guard."""
 
-_TO_GUARD = (GuardSettings, FlightSettings, Chunk, Reason, str, EndRequest)
+_TO_GUARD = (FlightSettings, Chunk, Reason, str, EndRequest)
 
 
-def encode(message: ToGuard | FromGuard) -> bytes:
-    """Encode a message of either process."""
+def encode(message: ToGuard | FromGuard | GuardSettings) -> bytes:
+    """Encode a message of either process, or the settings that the guard starts with."""
     file = io.BytesIO()
     _Pickler(file).dump(message)
     return file.getvalue()
+
+
+def decode_settings(data: bytes) -> GuardSettings:
+    """Decode the settings of the guard process."""
+    settings: GuardSettings = _decode(data, (GuardSettings,))
+    return settings
 
 
 def decode_to_guard(data: bytes) -> ToGuard:

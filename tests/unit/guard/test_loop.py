@@ -59,7 +59,6 @@ class Rig:
     def __init__(
         self,
         *,
-        first: list[ToGuard] | None = None,
         oversleep_ns: int = 0,
         lead_ns: int = 0,
         **status: Any,
@@ -67,8 +66,7 @@ class Rig:
         self.clock = FakeClock(oversleep_ns=oversleep_ns)
         self.link = FakeLink(self.clock, **status)
         self.port = FakePort()
-        received = [encode(message) for message in first or []]
-        self.loop = GuardLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
+        self.loop = GuardLoop(self.clock, self.link, self.port, lead_ns=lead_ns)
         self.solves = True
         self.serial = 0
 
@@ -278,7 +276,8 @@ def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
 def test_a_vehicle_that_moves_on_the_way_in_is_followed_as_in_flight() -> None:
     """A new session would give its sticks back, in the middle of a takeoff."""
     arms = flight_settings(engagement=engagement_settings(modes=("ALT_HOLD",), arm=True))
-    rig = Rig(first=[arms])
+    rig = Rig()
+    rig.tell(arms)
     rig.solves = False
     assert rig.run(0.1).ticks[-1].phase is Phase.PREPARING
     assert rig.link.is_engaged
@@ -332,7 +331,8 @@ def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> No
 def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
     has_policy: bool, seconds: float
 ) -> None:
-    rig = Rig(first=[FLIGHT] if has_policy else [])
+    rig = Rig()
+    rig.tell(*([FLIGHT] if has_policy else []))
     rig.link.is_restored = False
     rig.run(0.1)
     assert rig.link.restores == 0
@@ -352,7 +352,8 @@ def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
 
 
 def test_what_the_link_says_about_putting_back_is_still_passed_on() -> None:
-    rig = Rig(first=[FLIGHT])
+    rig = Rig()
+    rig.tell(FLIGHT)
     rig.run(0.1)
     rig.tell(EndRequest(reason=because(Code.SIGNAL)))
     restore = rig.link.restore

@@ -20,12 +20,13 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.values import Phase
+from mavbridge.guard.values import GuardSettings, Phase
 from mavbridge.guard.wire import (
     FromGuard,
     LastWords,
     ToGuard,
     decode_from_guard,
+    decode_settings,
     decode_to_guard,
     encode,
 )
@@ -51,6 +52,7 @@ OF_ANY_KIND = {
 @pytest.mark.parametrize(
     ("kind", "decode"),
     [
+        (GuardSettings, decode_settings),
         *((kind, decode_to_guard) for kind in get_args(ToGuard)),
         *((kind, decode_from_guard) for kind in SAID if kind not in ERRORS),
     ],
