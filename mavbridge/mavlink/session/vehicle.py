@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
@@ -123,11 +123,8 @@ _UPSET_NS = NS_PER_S
 _FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
 """Bounds for a reboot: the new uptime must not exceed the silence, times the pace of the fastest
 simulator clock, plus a margin."""
-_VERSION_TIMEOUT_NS = 400 * NS_PER_MS
-_VERSION_ATTEMPTS = 8
-"""Most requests to a vehicle that answers those for parameters."""
-_VERSION_PAUSE_NS = 10 * NS_PER_S
-"""Time between two later requests to a vehicle that answers none at all."""
+_VERSION_NS = NS_PER_S
+"""Time between two requests for the version, until it comes."""
 
 
 class VehicleSession:
@@ -155,8 +152,6 @@ class VehicleSession:
         """Shows a text to the user."""
         self._texts = TextJoiner()
         self.version: str | None = None
-        self._version_attempts = [0, 0]
-        """Requests before the vehicle answered one for a parameter, and since then."""
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
@@ -260,12 +255,8 @@ class VehicleSession:
     def step(self, now_ns: int) -> Iterator[Request]:
         """Yield the requests that are due."""
         self._show(*self._texts.step(now_ns))
-        asked, has_answered = self._version_attempts, self.params.has_answered
-        is_early = asked[has_answered] < _VERSION_ATTEMPTS
-        is_due = now_ns >= self._version_due_ns or asked[has_answered] == 0
-        if self.version is None and is_due and (is_early or not has_answered):
-            asked[has_answered] += 1
-            self._version_due_ns = now_ns + (_VERSION_TIMEOUT_NS if is_early else _VERSION_PAUSE_NS)
+        if self.version is None and now_ns >= self._version_due_ns:
+            self._version_due_ns = now_ns + _VERSION_NS
             number = float(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Parameters first: a vehicle slows its streams down while it sends parameters.
