@@ -13,8 +13,9 @@ from mavbridge.mavlink.profiles.profile import StreamGroup
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
 _ATTEMPTS = 4
 _PAUSE_NS = 10 * NS_PER_S
-"""Time between two requests for an optional message that the vehicle has left unanswered, so that a
-slow link is not loaded for ever. The first pauses are shorter: a gap of the link looks alike."""
+"""Time between two requests for an optional message that the vehicle has denied or left unanswered,
+so that a slow link is not loaded for ever. The first pauses are shorter: a gap of the link looks
+alike."""
 _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
 _UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
@@ -37,14 +38,14 @@ class _Stream:
 
     def __init__(self, group: StreamGroup) -> None:
         self.has_settled = False
-        """True if it has been granted or given up once."""
+        """True if it has been granted or put off once."""
         self.was_settled = False
         """True if it had been when the counting window began."""
         self.received: Counter[str] = Counter()
         """Messages by name: a vehicle may also send another one of the group unrequested."""
         self.newest_ns = self.stand_in_due_ns = self.due_ns = 0
-        self.silences = 0
-        """Times in a row that an optional group was given up without an answer."""
+        self.misses = 0
+        """Times in a row that an optional group was put off."""
         self.is_absence_told = False
         self.want(group)
 
@@ -53,9 +54,8 @@ class _Stream:
         self.group = group
         self._options = _options(group)
         self._at = self.attempts = 0
-        self.is_settled = self.is_given_up = self.is_denied = False
-        """Given up: an optional group that the vehicle does not grant. Denied: so was each option;
-        request again after a pause."""
+        self.is_settled = self.is_denied = False
+        """Denied: so was each option; request again after a pause."""
 
     @property
     def rate_hz(self) -> float:
@@ -68,26 +68,23 @@ class _Stream:
         self.is_denied = False
         return self._options[self._at][0]
 
-    def settle(self, *, is_given_up: bool = False) -> None:
-        """Note that the group is granted, or given up."""
+    def settle(self) -> None:
+        """Note that the group is granted, or put off until its rate is looked at."""
         self.is_settled, self.has_settled, self.attempts = True, True, 0
-        self.is_given_up = is_given_up
 
-    def refuse(self) -> None:
-        """Go on to the next option; an optional group is given up."""
-        self.attempts = 0
+    def refuse(self, now_ns: int) -> None:
+        """Go on to the next option; an optional group is put off."""
         if self.group.is_needed:
-            self._at = (self._at + 1) % len(self._options)
+            self._at, self.attempts = (self._at + 1) % len(self._options), 0
             self.is_denied = self._at == 0
         else:
-            self.settle(is_given_up=True)
+            self.put_off(now_ns)
 
-    def miss(self, requested_ns: int) -> None:
-        """Note silence since this request. A group that comes counts as granted, an optional one
-        until its rate is looked at; a required one is requested again."""
-        self.attempts = 0
-        if self.newest_ns > requested_ns or not self.group.is_needed:
-            self.settle()
+    def put_off(self, now_ns: int) -> None:
+        """Request an optional group again after a pause, unless it comes meanwhile."""
+        self.settle()
+        self.due_ns = now_ns + min(_WATCH_NS << self.misses, _PAUSE_NS)
+        self.misses += 1
 
     def arriving_hz(self, span_s: float) -> float:
         """Return the arrival rate of the group's most frequent message."""
@@ -164,7 +161,7 @@ class StreamRequester:
             stream.newest_ns = arrived_ns
 
     def has_settled(self, group: StreamGroup) -> bool:
-        """True if this group has been granted or given up."""
+        """True if this group has been granted or put off."""
         return self._by_message[group.messages[0]].has_settled
 
     def has_come(self, name: str) -> bool:
@@ -178,11 +175,11 @@ class StreamRequester:
             return
         if ack.result in _UNDECIDED:
             return  # repeated as if there were no answer
-        self._pending.silences = 0
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
+            self._pending.misses = 0
             self._pending.settle()
         else:
-            self._pending.refuse()
+            self._pending.refuse(self._requested_ns)
         self._pending = None
 
     def step(self, now_ns: int) -> CommandRequest | None:
@@ -191,12 +188,11 @@ class StreamRequester:
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
-            if self._pending.attempts >= (1 if self._pending.silences else _ATTEMPTS):
-                self._pending.miss(self._requested_ns)
-                if not self._pending.group.is_needed:  # the others first
-                    pause_ns = min(_WATCH_NS << self._pending.silences, _PAUSE_NS)
-                    self._pending.due_ns = now_ns + pause_ns
-                    self._pending.silences += 1
+            if self._pending.attempts >= (1 if self._pending.misses else _ATTEMPTS):
+                if self._pending.newest_ns > self._requested_ns:  # granted: the answer was lost
+                    self._pending.settle()
+                elif not self._pending.group.is_needed:  # the others first
+                    self._pending.put_off(now_ns)
                     self._streams.remove(self._pending)
                     self._streams.append(self._pending)
         may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
@@ -249,9 +245,7 @@ class StreamRequester:
                 stream.is_absence_told = True
                 comes = f"comes at {rate_hz:.1g} Hz" if stream.received else "does not come"
                 self._report(f"{group.messages[0]} {comes}: {group.without}")
-            if not stream.is_slow(span_s):
-                stream.is_given_up = False  # the denial was a late one of another request
-            elif not stream.is_given_up:
+            if stream.is_slow(span_s):
                 stream.is_settled = False
                 self.renewals += stream.group.is_needed
 

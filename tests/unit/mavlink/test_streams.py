@@ -84,8 +84,8 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     asked = [ids(request)[0] for request in requested[4:]]
     once = [number for number in (1, 245, 193, 0) for _ in range(attempts)]
     assert asked[: len(once)] == once
-    # silence may be a gap of the link: asked for again after each look at the rates
-    assert set(asked[len(once) :]) == (set(once) if answer is None else set())
+    # silence may be a gap of the link, and a denial that of another request: asked for again
+    assert set(asked[len(once) :]) == set(once)
     assert requester.renewals == 0
 
 
@@ -181,8 +181,6 @@ class Link:
         """Messages that the vehicle grants and does not send."""
         self.unanswered: set[int] = set()
         """Requests, counted from 1, whose answers are lost."""
-        self.denied: set[int] = set()
-        """Messages whose grants are answered by the late denial of another request."""
         self.mute: set[int] = set()
         """Messages whose requests the vehicle neither grants nor answers."""
         self.stand_ins = 0
@@ -196,8 +194,7 @@ class Link:
                     continue
                 self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
                 if len(self.asked) not in self.unanswered:
-                    is_denied = request.params[0] in self.denied
-                    self.requester.receive_ack(ack(2 if is_denied else 0))
+                    self.requester.receive_ack(ack(0))
             self.stand_ins += len(list(self.requester.stand_ins(self._now_ns)))
             self.share = min(1.0, self.capacity_hz / max(sum(self.rates_hz.values()), 1.0))
             for number, rate_hz in self.rates_hz.items():
@@ -267,19 +264,6 @@ def test_a_stream_that_is_granted_late_is_not_missed_before() -> None:
     link.unanswered = {5, 6, 7, 8}  # for the length of the first counting window
     link.run(10.0)
     assert link.texts == []
-
-
-def test_a_stream_that_comes_in_spite_of_a_denial_is_kept_coming() -> None:
-    """Acks carry no message: a late one of a repeated request counts for the next."""
-    link = Link(PX4.streams(state_hz=100), capacity_hz=1e4)
-    link.denied = {IDS["SYS_STATUS"], IDS["CURRENT_MODE"]}
-    link.silent = {IDS["SYS_STATUS"]}
-    link.run(5.0)
-    link.rates_hz[IDS["CURRENT_MODE"]] = 0.5
-    link.denied.clear()
-    link.asked.clear()
-    link.run(5.0)
-    assert link.asked == [(IDS["CURRENT_MODE"], 50.0)]
 
 
 def test_a_vehicle_that_was_off_is_asked_as_before() -> None:
