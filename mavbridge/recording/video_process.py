@@ -108,6 +108,8 @@ class VideoJob(NamedTuple):
     """Records of the link's log, which is written beside the video."""
 
 
+SURVIVED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
+"""Signals to the process group that the writer ignores: the producer tells it when to end."""
 PERIOD_S = 0.05
 """Time between two reads of the log. Waking at each record would cost the link's process time."""
 TLOG_S = 60.0
@@ -154,9 +156,8 @@ FromWriter: TypeAlias = Written | Failed | Notice
 
 def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob, niceness: int) -> None:
     """Entry point of the process."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    for number in SURVIVED:
+        signal.signal(number, signal.SIG_IGN)
     os.nice(niceness)
     service = WriterService(pipe, job)
     service.send(Notice.READY)

@@ -2,9 +2,11 @@
 
 import multiprocessing
 import os
+import signal
 import weakref
 from collections import deque
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Literal
@@ -13,6 +15,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.video_process import (
     NICENESS,
+    SURVIVED,
     Failed,
     FromWriter,
     Notice,
@@ -213,9 +216,13 @@ def start_process(
     process = context.Process(
         target=run_writer, args=(its_pipe, job, niceness), name="mavbridge-writer", daemon=True
     )
+    resource_tracker.ensure_running()  # its start unblocks signals
+    # Blocked until the process ignores them: a Ctrl-C would end its start.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SURVIVED)
     try:
         process.start()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
         if job.tlog is not None:
             job.tlog.close()

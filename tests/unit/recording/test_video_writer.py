@@ -96,6 +96,25 @@ def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> No
         assert "has died" in reasons[0]
 
 
+def test_a_signal_to_its_group_does_not_end_a_writer_that_starts(tmp_path: Path) -> None:
+    start = video_writer.start_process
+
+    def struck(*job: Any) -> Any:
+        started = start(*job)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            os.kill(started[1].pid, number)
+        return started
+
+    with (
+        patch.object(video_writer, "start_process", struck),
+        writer(tmp_path, "offline") as video,
+    ):
+        video.submit(picture(0), 0)
+        video.finish()
+    assert read_back(tmp_path / "camera.mp4") == [0]
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
+
+
 class Alive:
     """A process that never ends; the service is driven by hand in the same thread."""
 
