@@ -237,7 +237,8 @@ def over(m: Memory, _: EngagementInputs) -> bool:
 
 def entered_late(m: Memory, now: EngagementInputs) -> Reason | None:
     """the vehicle enters a mode of ours after all, within 1.5 s of the request"""
-    if not m.has_asked(now) or now.status.mode == m.released_mode:
+    is_other = now.status.mode != m.released_mode and not now.status.is_failsafe
+    if not (is_other and m.has_asked(now)):
         return None
     if (why := m.unheld(now)) is not None:
         return because(Code.NOT_RELEASED, instead=now.status.mode, why=why)
