@@ -40,9 +40,8 @@ SETPOINT_NS = 500 * NS_PER_MS
 answered by then does not hear us. It would return to OFFBOARD within 30 ms of hearing a setpoint
 after its failsafe (COM_OF_LOSS_T, 1 s)."""
 STICK_REST_NS = NS_PER_S
-"""Longest wait for our sticks to come to rest before the safe mode is requested anyway: 0.6 s after
-a jump over the full range, PX4 sees less than 0.05 per second, the slowest motion that counts as a
-hand."""
+"""Longest wait for our sticks to come to rest before the safe mode is requested anyway: PX4 looks
+at them in turn, and takes 0.28 s for each that has jumped by half its range."""
 UNDONE_NS = NS_PER_S
 """Time in a safe mode within which PX4 may leave it because of our jump to neutral, and time since
 it did not get our sticks: then they jump to those of a receiver at rest, and back."""

@@ -80,7 +80,8 @@ class StickInput:
         self._params = params
         self.sticks = Px4Sticks()
         self.valid = False  # the winner is still sending
-        self.count = 0  # samples chosen so far; a change tells a reader of a new one
+        self.count = 0
+        """Samples published so far. Without news each poll repeats the last, as does the loss."""
         self.sampled_ns = 0
         self.moved_fast = False
         """A stick moves faster than COM_RC_STICK_OV or MAN_OVERRIDE_SPD."""
@@ -114,7 +115,7 @@ class StickInput:
             for source, sticks in unread.items():  # one that follows in this check: no failsafe
                 self.on_sticks(source, sticks, now_ns)
             if not self.valid:
-                self.moved_fast = False
+                self.count, self.moved_fast = self.count + 1, False
                 self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         if self.valid and now_ns - self._looked_ns >= POLL_NS:
             self._look(now_ns)
@@ -138,21 +139,25 @@ class StickInput:
         is_old = "COM_RC_STICK_OV" in self._params
         dt_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
         self._unread.clear()
+        self.count += 1
         limit = self._params["COM_RC_STICK_OV" if is_old else "MAN_OVERRIDE_SPD"]
         limit_per_s = 0.01 * limit if is_old else limit
         moves = 0 if is_old else FAST_SAMPLES
-        for speed, value in zip(self._speeds, self.sticks, strict=True):
-            speed.update(value, dt_s, OLD_TAU_S if is_old else TAU_S)
-        self.moved_fast = limit_per_s > 0.0 and any(
-            abs(speed.per_s) > limit_per_s and speed.moves_one_way >= moves
-            for speed in self._speeds
-        )
+        tau_s = OLD_TAU_S if is_old else TAU_S
+
+        def is_fast(speed: StickSpeed, value: float) -> bool:
+            speed.update(value, dt_s, tau_s)
+            return abs(speed.per_s) > limit_per_s and speed.moves_one_way >= moves
+
+        # PX4 looks at a stick only if those before it rest, and then sees all of its movement.
+        forward, right, throttle, yaw = self.sticks
+        values = (right, forward, yaw, throttle)
+        self.moved_fast = limit_per_s > 0.0 and any(map(is_fast, self._speeds, values))
 
     def _choose(self, sticks: Px4Sticks, now_ns: int) -> None:
         self.sticks, self.sampled_ns, self.valid = sticks, now_ns, True
         self._look(now_ns)
         self._never_ages = False
-        self.count += 1
 
 
 def curve(value: float, dead_zone: float) -> float:

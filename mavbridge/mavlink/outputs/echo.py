@@ -23,11 +23,6 @@ MATCH_NS = 700 * NS_PER_MS
 five lost packets at 30 Hz, one interval of the echo message, and a margin."""
 MOST_COMMANDS = 2048
 """Five seconds at 400 Hz: longer than a vehicle holds sticks that it no longer hears."""
-SILENT_US = 400_000
-"""Longest time that the echo may be constant, by the vehicle's clock. The command changes every 25
-ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
-SILENT_SAMPLES = 8
-"""Fewest echo messages in SILENT_US, as at 20 Hz: after losses a few may agree by chance."""
 OFTEN_US = 500_000
 RETURNED_SAMPLES = 2
 """Samples within OFTEN_US that show the values from before us and count as a fault. One is a stray
@@ -66,6 +61,11 @@ class EchoRules:
     foreign values for a moment before the new mode is reported."""
     longest_pause_ns: int = NS_PER_S
     """Gap in the echo messages after which our commands count as lost."""
+    silent_us: int = 400_000
+    """Longest time that the echo may be constant, by the vehicle's clock. The command changes every
+    25 ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
+    silent_samples: int = 8
+    """Fewest repetitions in ``silent_us``, as at 20 Hz: after losses a few may agree by chance."""
     hand: int = 0
     """Largest movement of another source at rest since our first command: more shows a hand. 0: the
     message does not show sticks."""
@@ -119,9 +119,9 @@ class EchoCheck:
         """True if a command was sent and not released since."""
         return self._since_ns is not None
 
-    def is_unshown(self, now_ns: int) -> bool:
+    def is_unshown(self, now_ns: int, pause_ns: int | None = None) -> bool:
         """True if no echo message has arrived for too long."""
-        pause_ns = self._rules.longest_pause_ns
+        pause_ns = pause_ns or self._rules.longest_pause_ns
         return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
     def is_deaf(self, now_ns: int) -> bool:
@@ -248,7 +248,8 @@ class EchoCheck:
             self._held, self._held_since_us, self._held_samples = values, shown_us, 0
         self._held_samples += 1
         held_us = shown_us - self._held_since_us
-        if held_us >= SILENT_US and self._held_samples >= SILENT_SAMPLES:
+        is_held = self._held_samples >= self._rules.silent_samples
+        if held_us >= self._rules.silent_us and is_held:
             self._fail("silent", now_ns)
 
     def _fail(self, fault: EchoFault, now_ns: int, *, is_hand: bool = False) -> None:

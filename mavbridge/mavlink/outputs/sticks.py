@@ -1,5 +1,6 @@
 """Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), with echoes."""
 
+import math
 from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -183,10 +184,12 @@ MANUAL_ECHO = EchoRules(
     seek_dither=4,
     centre=0,
     longest_pause_ns=450 * NS_PER_MS,
+    silent_us=350_000,
+    silent_samples=3,
     hand=20,
 )
 """Echo of x, y, z, r. PX4 shows received sticks, or one less (rounded down), at the rate of
-reception, and nothing if it receives nothing.
+reception. Without news it repeats the last every 200 ms, until they count as lost after 600 ms.
 
 The dither is on r, which has a dead zone of a tenth; outside it, 4 units are 0.5 degrees/s.
 """
@@ -195,6 +198,8 @@ _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
 pilot's hand, which ends the mode."""
 _HELD_NS = 700 * NS_PER_MS
 """Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling."""
+_GONE_NS = 200 * NS_PER_MS
+"""Pause in the echo after that time in which it holds none."""
 _SPEED_TAU_S = 0.1
 """Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
@@ -213,8 +218,10 @@ class ManualControlOutput(StickOutput):
         self._last: Shown = (0, 0, STICK_END // 2, 0)
         """Last x, y, z, r that were sent, at ``_sent_ns``."""
         self._sent_ns = 0
-        self._speeds_per_s: tuple[float, ...] = (0.0,) * 4
-        """Speeds of the sent sticks [full sticks/s], as in PX4's detector of a pilot's hand."""
+        self._seen, self._speeds_per_s = [0, 0, 0, STICK_END], [0.0] * 4
+        """The sent sticks y, x, r, 2 z and their speeds [full sticks/s], as in PX4's detector of a
+        pilot's hand."""
+        self._hand_per_s = math.inf
         self._shown: tuple[int, Sticks] | None = None
         """Arrival of the sticks that the vehicle acts on, and those sticks."""
         self._pilot: Sticks | None = None
@@ -223,26 +230,26 @@ class ManualControlOutput(StickOutput):
     def sent(self, encoded: Encoded, now_ns: int) -> None:
         """Note sticks that were sent, and their speeds."""
         super().sent(encoded, now_ns)
-        last, dt_s = self._last, (now_ns - self._sent_ns) / NS_PER_S
-        self._last, self._sent_ns = encoded.shown or last, now_ns
+        dt_s = (now_ns - self._sent_ns) / NS_PER_S
+        self._last, self._sent_ns = encoded.shown or self._last, now_ns
         if dt_s <= 0.0:
             return
-        x, y, z, r = (value - before for value, before in zip(self._last, last, strict=True))
+        x, y, z, r = self._last
         weight = dt_s / (_SPEED_TAU_S + dt_s)
-        moves = (x, y, 2 * z, r)  # z has half the range
-        self._speeds_per_s = tuple(
-            speed + weight * (move / STICK_END / dt_s - speed)
-            for speed, move in zip(self._speeds_per_s, moves, strict=True)
-        )
+        for k, value in enumerate((y, x, r, 2 * z)):  # z has half the range
+            move, self._seen[k] = (value - self._seen[k]) / STICK_END, value
+            self._speeds_per_s[k] += weight * (move / dt_s - self._speeds_per_s[k])
+            if abs(self._speeds_per_s[k]) > self._hand_per_s:
+                break  # PX4 looks at a stick only if those before it rest
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
         """True if our sticks are slower than a hand, by this firmware version's parameter."""
-        fastest_per_s = max(map(abs, self._speeds_per_s))
-        return fastest_per_s < _REST_SHARE * vehicle.params.traits.hand_per_s
+        return max(map(abs, self._speeds_per_s)) < _REST_SHARE * vehicle.params.traits.hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the four sticks, rounded."""
         sticks, curves = self._wanted(action, vehicle, now_ns)
+        self._hand_per_s = vehicle.params.traits.hand_per_s
         shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
         values = ManualControl._make(shown)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
@@ -288,5 +295,5 @@ class ManualControlOutput(StickOutput):
 
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
         """True if the vehicle shows other sticks, or none any more."""
-        is_over = now_ns - self._sent_ns > _HELD_NS and self.echo.is_unshown(now_ns)
+        is_over = now_ns - self._sent_ns > _HELD_NS and self.echo.is_unshown(now_ns, _GONE_NS)
         return self.echo.is_released or (is_over and not self.echo.is_sending)
