@@ -64,7 +64,7 @@ class GuardProcess:
         ours, theirs = channel_pair()
         samples, their_samples = channel_pair()
         self._clock = clock
-        self._port = SocketPort(ours, takes_files=True)
+        self._port = SocketPort(ours)
         self.samples = SocketPort(samples)
         """The vehicle's readings, for a ``TelemetryCache``."""
         self._leftover = "; what --set has changed stays so" if settings.link.set_params else ""

@@ -50,22 +50,16 @@ class SocketPort:
     has died; it comes after the process's memory is freed: 90 to 680 ms for 600 MB.
     """
 
-    def __init__(
-        self, end: socket.socket, *, takes_files: bool = False, peer_pid: int | None = None
-    ) -> None:
-        """Use this end.
+    def __init__(self, end: socket.socket, *, peer_pid: int | None = None) -> None:
+        """Use this end, not blocking from now on.
 
-        Args:
-            end: our end, not blocking from now on.
-            takes_files: keep received open files instead of closing them.
-            peer_pid: the other process; on Linux its death is then noticed before end of file.
+        ``peer_pid``: the other process; on Linux its death is then noticed before end of file.
         """
         end.setblocking(False)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
         self._socket = end
         self._unsent = b""
         self._partial = b""
-        self._takes_files = takes_files
         self._peer_stat: int | None = None
         if peer_pid is not None:
             with suppress(OSError):  # no such file on macOS
@@ -112,7 +106,10 @@ class SocketPort:
             if self.is_closed:
                 break
             try:
-                data = self._read()
+                data, files, _, _ = socket.recv_fds(
+                    self._socket, _RECEIVE_BYTES, 1, _CLOSED_ON_EXEC
+                )
+                self.files.extend(files)
             except BlockingIOError:
                 self.is_closed = is_last
                 break
@@ -139,13 +136,6 @@ class SocketPort:
         except OSError:
             return True  # its parent has reaped it
         return bool(int(stat.rpartition(b")")[2].split()[_FLAGS]) & _PF_EXITING)
-
-    def _read(self) -> bytes:
-        if not self._takes_files:
-            return self._socket.recv(_RECEIVE_BYTES)
-        data, files, _, _ = socket.recv_fds(self._socket, _RECEIVE_BYTES, 1, _CLOSED_ON_EXEC)
-        self.files.extend(files)
-        return data
 
     def finish(self, message: bytes, timeout_s: float) -> None:
         """Send the last message within ``timeout_s``, then close the socket."""
