@@ -22,8 +22,8 @@ from mavbridge.guard.values import EndRequest, GuardSettings, Outcome
 from mavbridge.guard.wire import (
     GuardDiedError,
     GuardSummary,
-    decode_settings,
     encode,
+    read_settings,
 )
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
@@ -45,7 +45,7 @@ def main() -> None:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     ends = [socket.socket(fileno=int(fd)) for fd in sys.argv[1:]]
     port, samples = SocketPort(ends[0], peer_pid=os.getppid()), SocketPort(ends[1])
-    settings = decode_settings(sys.stdin.buffer.read())
+    settings = read_settings(sys.stdin.buffer)
     try:
         with ExitStack() as stack:
             _run(settings, port, samples, stack)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from importlib import import_module
-from typing import Any, NamedTuple, TypeAlias, get_args
+from typing import Any, BinaryIO, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
@@ -122,9 +122,9 @@ def encode(message: ToGuard | FromGuard | GuardSettings) -> bytes:
     return file.getvalue()
 
 
-def decode_settings(data: bytes) -> GuardSettings:
-    """Decode the settings of the guard process."""
-    settings: GuardSettings = _decode(data, (GuardSettings,))
+def read_settings(file: BinaryIO) -> GuardSettings:
+    """Read the settings of the guard process; what is behind them is not waited for."""
+    settings: GuardSettings = _Unpickler(file).load()
     return settings
 
 

@@ -1,5 +1,6 @@
 """Every message between the processes arrives as it was sent."""
 
+import io
 import os
 from collections.abc import Callable
 from enum import Enum, StrEnum
@@ -26,9 +27,9 @@ from mavbridge.guard.wire import (
     LastWords,
     ToGuard,
     decode_from_guard,
-    decode_settings,
     decode_to_guard,
     encode,
+    read_settings,
 )
 
 numbers = st.floats(allow_nan=False)  # NaN is not equal to itself
@@ -52,7 +53,7 @@ OF_ANY_KIND = {
 @pytest.mark.parametrize(
     ("kind", "decode"),
     [
-        (GuardSettings, decode_settings),
+        (GuardSettings, lambda data: read_settings(io.BytesIO(data))),
         *((kind, decode_to_guard) for kind in get_args(ToGuard)),
         *((kind, decode_from_guard) for kind in SAID if kind not in ERRORS),
     ],
