@@ -46,6 +46,9 @@ class FlownVehicle:
         self.is_known = True
         """True if it has sent a heartbeat since its session began."""
 
+    def use_output(self, _name: str) -> None:
+        """No-op: its echo comes anyway."""
+
     def status(self, _now_ns: int) -> VehicleStatus | None:
         if not self.is_known:
             return None

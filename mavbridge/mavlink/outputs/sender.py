@@ -170,7 +170,7 @@ class ActionSender:
             output.released()
         self.is_release_owed = not is_sent
         if is_sent:
-            self._releases = sent + 1
+            self._releases = sent + (packet is not None)
             self._release_due_ns = self._clock.now_ns() + RELEASE_SPACING_NS
         return is_sent
 

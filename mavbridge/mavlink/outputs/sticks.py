@@ -146,9 +146,8 @@ class OverrideOutput(StickOutput):
 
     def must_release(self, sent: int, now_ns: int) -> bool:
         """True for a while, and as long as a vehicle with a receiver has not heard any."""
-        is_deaf = self.echo.is_deaf(now_ns)
-        has_receiver = self._status is not None and self._status.has_receiver
-        return super().must_release(sent, now_ns) or bool(has_receiver and is_deaf)
+        has_receiver = self._status is not None and self._status.has_receiver is True
+        return super().must_release(sent, now_ns) or (has_receiver and self.echo.is_deaf(now_ns))
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
@@ -219,8 +218,7 @@ class ManualControlOutput(StickOutput):
         """Last x, y, z, r that were sent, at ``_sent_ns``."""
         self._sent_ns = 0
         self._seen, self._speeds_per_s = [0, 0, 0, STICK_END], [0.0] * 4
-        """The sent sticks y, x, r, 2 z and their speeds [full sticks/s], as in PX4's detector of a
-        pilot's hand."""
+        """Sent y, x, r, 2 z, and their speeds [full sticks/s] as PX4 sees them."""
         self._hand_per_s = math.inf
         self._shown: tuple[int, Sticks] | None = None
         """Arrival of the sticks that the vehicle acts on, and those sticks."""

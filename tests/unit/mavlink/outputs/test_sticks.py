@@ -1,9 +1,11 @@
 """Sticks by MANUAL_CONTROL and by overrides: the vehicle's curves, the echo, the release."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from helpers.fakes import FakeClock
 from helpers.flown_vehicle import Flight, FlownVehicle, codec
 from helpers.wire import ARDUPILOT as CALIBRATION
 from mavbridge.core.clock import NS_PER_MS
@@ -15,12 +17,13 @@ from mavbridge.core.vehicle import (
     ActionMeaning,
     AttitudeThrust,
     Output,
+    Release,
     StickGains,
     Sticks,
 )
 from mavbridge.mavlink.codec.messages import ManualControl, RcChannels
 from mavbridge.mavlink.codec.packets import CommandRefusedError
-from mavbridge.mavlink.outputs.sender import choose_output
+from mavbridge.mavlink.outputs.sender import ActionSender, choose_output
 from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
@@ -164,6 +167,26 @@ def test_the_last_sticks_are_neutral_ones_where_sticks_are_flown(
     packet = flight.output.release_packet(flight.session, flight.now_ns)
     sent = [(m.x, m.y, m.z, m.r) for m in flight.end.read(packet or b"")]
     assert sent == ([] if last is None else [last])
+
+
+@pytest.mark.parametrize("after_ms", [50, 650, 750])
+def test_a_hold_that_our_moving_sticks_end_leaves_px4_with_level_ones(after_ms: int) -> None:
+    """PX4 takes them for the hand of the pilot who has chosen it: POSCTL, on our last sticks."""
+    flight, clock, packets = px4_flight(), FakeClock(), list[bytes]()
+    connection: Any = SimpleNamespace(send=lambda packet: packets.append(packet) or True)
+    sender = ActionSender(connection, codec(), clock)
+    sender.begin_flight(ActionMeaning(kind="sticks"), None)
+    sender.equip(flight.session)
+    sender.send(Sticks(0.3, 0.2, 0.5, -0.5))
+    flight.vehicle.mode = "AUTO.LOITER"
+    for k in range(100):
+        if k * 10 == after_ms:
+            flight.vehicle.mode = "POSCTL"
+        sender.send(Release())
+        clock.advance_ns(10 * MS)
+    _, *levels = (flight.end.read(packet)[0] for packet in packets)
+    expected = [NEUTRAL_SENT] if after_ms < 700 else []  # it holds none by then
+    assert [(m.x, m.y, m.z, m.r) for m in levels] == expected
 
 
 def test_the_pilots_sticks_are_those_that_px4_shows_without_ours() -> None:
