@@ -219,9 +219,7 @@ class Engagement(Memory):
         channel = self.settings.engage_channel
         if channel is None or len(now.status.rc_channels_us) < channel:
             return False
-        arrived_ns = (
-            now.now_ns if now.status.channels_arrived_ns is None else now.status.channels_arrived_ns
-        )
+        arrived_ns = now.status.channels_arrived_ns or now.now_ns
         was_off = self.switch.is_off
         is_act = self.switch.read(now.status.rc_channels_us[channel - 1], arrived_ns)
         if now.status.is_failsafe or now.status.is_receiver_sick:

@@ -320,9 +320,8 @@ class DisengageSequence:
             return True
         is_bounded = now.now_ns - self.began_ns >= STICK_REST_NS
         self.has_failed = self.has_failed or now.command_fault is not None
-        if self.has_failed:
-            return is_bounded  # the time at which neutral was sent is unknown
-        return is_bounded or (now.link.are_sticks_at_rest and now.now_ns > self.began_ns)
+        is_known = not self.has_failed and now.now_ns > self.began_ns  # when neutral was sent
+        return is_bounded or (is_known and now.link.are_sticks_at_rest)
 
     def _may_ask(self, now: EngagementInputs, unheard_ns: int | None) -> bool:
         """True if the mode is known, or the vehicle's failsafe cannot have acted yet."""

@@ -347,9 +347,8 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     # The flag of a failsafe that kept our mode stays up, and does not tell who changes the mode.
     codes = m.reason.codes if m.phase in (LEAVING, HOLDING) and m.reason is not None else ()
     failsafe = None if Code.FAILSAFE in codes else _failsafe(m, now, keeps_mode=False)
-    if (reason := failsafe or changed) is not None:
-        return reason
-    return because(Code.DISARMED) if m.was_armed and not now.status.armed else None
+    is_disarmed = m.was_armed and not now.status.armed
+    return failsafe or changed or (because(Code.DISARMED) if is_disarmed else None)
 
 
 class Transition(NamedTuple):

@@ -25,8 +25,6 @@ OLD_TAU_S, TAU_S = 0.1, 0.05  # low-pass of a stick's speed, before 1.18 and in 
 _RECEIVER_ONLY, _LINKS_ONLY, _NONE, *_PRIORITIES = 0, 1, 4, 5, 6, 7, 8
 """Values of COM_RC_IN_MODE. 2 takes any source, and keeps it until it is lost. From 5 on a source
 replaces a lower one at once: 6 and 8 prefer links to the receiver, 7 and 8 the highest link."""
-
-
 EXPO = 0.6
 """Expo of climb, yaw and POSCTL's speed: 0.4 x + 0.6 x^3 beyond a dead zone, as measured. Leans
 have no dead zone; they are linear in the tangent in ALTCTL, in the angle in STAB."""
@@ -57,9 +55,8 @@ class StickSpeed:
 
     def __init__(self) -> None:
         self.per_s = 0.0
-        self.moves_one_way = 0  # consecutive movements in one direction
+        self.moves = 0  # consecutive ones in one direction, + up
         self._last: float | None = None
-        self._is_up = False
 
     def update(self, value: float, dt_s: float, tau_s: float) -> None:
         """Take a sample; the first one after a reset is no movement."""
@@ -68,9 +65,8 @@ class StickSpeed:
             return
         self.per_s += dt_s / (tau_s + dt_s) * ((value - last) / dt_s - self.per_s)
         if value != last:
-            is_same_way = self.moves_one_way > 0 and (value > last) is self._is_up
-            self.moves_one_way = self.moves_one_way + 1 if is_same_way else 1
-            self._is_up = value > last
+            step = 1 if value > last else -1
+            self.moves = step + (self.moves if self.moves * step > 0 else 0)
 
 
 class StickInput:
@@ -142,12 +138,11 @@ class StickInput:
         self.count += 1
         limit = self._params["COM_RC_STICK_OV" if is_old else "MAN_OVERRIDE_SPD"]
         limit_per_s = 0.01 * limit if is_old else limit
-        moves = 0 if is_old else FAST_SAMPLES
-        tau_s = OLD_TAU_S if is_old else TAU_S
+        moves, tau_s = (0, OLD_TAU_S) if is_old else (FAST_SAMPLES, TAU_S)
 
         def is_fast(speed: StickSpeed, value: float) -> bool:
             speed.update(value, dt_s, tau_s)
-            return abs(speed.per_s) > limit_per_s and speed.moves_one_way >= moves
+            return abs(speed.per_s) > limit_per_s and abs(speed.moves) >= moves
 
         # PX4 looks at a stick only if those before it rest, and then sees all of its movement.
         forward, right, throttle, yaw = self.sticks

@@ -186,7 +186,9 @@ class EchoCheck:
             self.is_released |= self._held_ours is None
             self.shows_last = bool(self._sent) and self._is_near(values, self._sent[-1][1])
         elif self._is_paused(now_ns):
-            self._note_pause(values, now_ns)
+            self._forget_shown()
+            if not self._sent or now_ns - self._sent[-1][0] > MATCH_NS:
+                self._baseline = values
         else:
             self._judge(values, shown_us, now_ns)
 
@@ -229,12 +231,6 @@ class EchoCheck:
         """True if our last command is too old for the echo to tell anything about us."""
         return not self._sent or now_ns - self._sent[-1][0] > _PAUSE_NS
 
-    def _note_pause(self, values: Shown, now_ns: int) -> None:
-        """Judge nothing; after a long pause, store the values as the new baseline."""
-        self._forget_shown()
-        if not self._sent or now_ns - self._sent[-1][0] > MATCH_NS:
-            self._baseline = values
-
     def _restart(self, now_ns: int) -> None:
         """Restart echo tracking after a gap in commands, when any value is legitimate."""
         if self.is_sending:
@@ -248,8 +244,7 @@ class EchoCheck:
             self._held, self._held_since_us, self._held_samples = values, shown_us, 0
         self._held_samples += 1
         held_us = shown_us - self._held_since_us
-        is_held = self._held_samples >= self._rules.silent_samples
-        if held_us >= self._rules.silent_us and is_held:
+        if self._held_samples >= self._rules.silent_samples and held_us >= self._rules.silent_us:
             self._fail("silent", now_ns)
 
     def _fail(self, fault: EchoFault, now_ns: int, *, is_hand: bool = False) -> None:

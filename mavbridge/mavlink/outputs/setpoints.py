@@ -137,9 +137,8 @@ class VelocityOutput(SetpointOutput):
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
         """Compare the down velocity, if the target has one (a takeoff has a position)."""
-        if not isinstance(body, VelocityTarget):
-            return
-        if not body.type_mask & dialect.POSITION_TARGET_TYPEMASK_VZ_IGNORE:
+        no_vz = dialect.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+        if isinstance(body, VelocityTarget) and not body.type_mask & no_vz:
             shown = (round(body.velocity_ned_mps[2] * MM_PER_M),)
             self.echo.received(shown, arrived_ns // 1000, arrived_ns)
 
@@ -332,8 +331,6 @@ class AttitudeOutput(SetpointOutput):
                 is_own = self._sent_ns is None or arrived_ns - self._sent_ns > _PAUSE_NS
                 if is_own and self._is_level and self._is_flying(vehicle, arrived_ns):
                     self._hover.receive_thrust(body.thrust, arrived_ns)
-            case _:
-                pass
 
     def _is_flying(self, vehicle: VehicleSession, now_ns: int) -> bool:
         status = vehicle.status(now_ns)

@@ -195,10 +195,9 @@ The dither is on r, which has a dead zone of a tenth; outside it, 4 units are 0.
 _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
 """Modes flown by sticks. In other modes the last sticks do nothing, but a jump may be taken for the
 pilot's hand, which ends the mode."""
-_HELD_NS = 700 * NS_PER_MS
-"""Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling."""
-_GONE_NS = 200 * NS_PER_MS
-"""Pause in the echo after that time in which it holds none."""
+_HELD_NS, _GONE_NS = 700 * NS_PER_MS, 200 * NS_PER_MS
+"""Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling;
+pause in the echo after that time in which it holds none."""
 _SPEED_TAU_S = 0.1
 """Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
