@@ -1,21 +1,34 @@
-"""Encoding of the messages between the flight process and the guard: pickles.
+"""Encoding of the messages between the flight process and the guard.
 
-They are safe here: one process has started the other, and no third one has an end of the channel.
+Samples and chunks, which lie between an attitude and its command, are little-endian structures; all
+others are pickles. Pickles are safe here: one process has started the other, and no third one has
+an end of the channel.
 """
 
 import io
 import pickle
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from importlib import import_module
+from itertools import chain
 from typing import Any, BinaryIO, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import ForwardedPacket, LinkStats, Sample, Sticks
+from mavbridge.core.vehicle import (
+    ACTION_CLASSES,
+    ForwardedPacket,
+    LinkStats,
+    Reading,
+    Sample,
+    Sticks,
+    Telemetry,
+)
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import (
     EndRequest,
@@ -26,8 +39,15 @@ from mavbridge.guard.values import (
     Phase,
 )
 
+_CHUNK = struct.Struct("<cBqqqqqqqqH")
+_ACTION = struct.Struct("<4d")
+_QUANTITIES = Telemetry._fields
+_SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
+"""Layout of a sample by quantity: index, arrival, delay, values."""
+_CLASSES = tuple(ACTION_CLASSES.values())
 _MALFORMED = (
-    *(pickle.UnpicklingError, EOFError, ValueError, TypeError, LookupError, AttributeError),
+    *(struct.error, pickle.UnpicklingError, EOFError),
+    *(ValueError, TypeError, LookupError, AttributeError),
 )
 """Errors of the decoders on malformed bytes."""
 
@@ -117,6 +137,10 @@ _TO_GUARD = (FlightSettings, Chunk, Reason, str, EndRequest)
 
 def encode(message: ToGuard | FromGuard | GuardSettings) -> bytes:
     """Encode a message of either process, or the settings that the guard starts with."""
+    if isinstance(message, Samples):
+        return _encode_samples(message)
+    if isinstance(message, Chunk):
+        return _encode_chunk(message)
     file = io.BytesIO()
     _Pickler(file).dump(message)
     return file.getvalue()
@@ -143,12 +167,50 @@ def decode_from_guard(data: bytes) -> FromGuard:
 def _decode(data: bytes, kinds: tuple[type, ...]) -> Any:
     message: object = None
     try:
-        message = _Unpickler(io.BytesIO(data)).load()
+        if data[:1] == b"C":
+            message = _decode_chunk(data)
+        elif data[:1] == b"R":
+            message = Samples(tuple(_decode_samples(data)))
+        else:  # a pickle, which begins with its version
+            message = _Unpickler(io.BytesIO(data)).load()
     except _MALFORMED as error:
         raise ValueError(f"not a message: {data[:16]!r}") from error
     if not isinstance(message, kinds):
         raise ValueError(f"not a message of that process: {message!r}")  # noqa: TRY004 - malformed
     return message
+
+
+def _encode_chunk(chunk: Chunk) -> bytes:
+    stamps = (*chunk[:7], chunk.reset_ns)
+    count = len(chunk.actions)
+    kind = _CLASSES.index(type(chunk.actions[0])) if count else 0
+    values = struct.pack(f"<{4 * count}d", *chain.from_iterable(chunk.actions))
+    return _CHUNK.pack(b"C", kind, *stamps, count) + values
+
+
+def _decode_chunk(data: bytes) -> Chunk:
+    _, kind, *stamps, reset_ns, count = _CHUNK.unpack_from(data)
+    if len(data) != _CHUNK.size + count * _ACTION.size:
+        raise ValueError("a chunk of another length")
+    actions = _ACTION.iter_unpack(memoryview(data)[_CHUNK.size :])
+    return Chunk._make((*stamps, tuple(map(_CLASSES[kind]._make, actions)), reset_ns))
+
+
+def _encode_samples(message: Samples) -> bytes:
+    parts = [b"R"]
+    for name, (arrived_ns, values, delay_ns) in message.samples:
+        number = _QUANTITIES.index(name)
+        parts.append(_SAMPLES[number].pack(number, arrived_ns, delay_ns, *values))
+    return b"".join(parts)
+
+
+def _decode_samples(data: bytes) -> Iterator[Sample]:
+    at = 1
+    while at < len(data):
+        layout = _SAMPLES[data[at]]
+        number, arrived_ns, delay_ns, *values = layout.unpack_from(data, at)
+        yield Sample(_QUANTITIES[number], Reading(arrived_ns, tuple(values), delay_ns))
+        at += layout.size
 
 
 class _Pickler(pickle.Pickler):

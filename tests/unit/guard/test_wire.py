@@ -2,6 +2,7 @@
 
 import io
 import os
+import struct
 from collections.abc import Callable
 from enum import Enum, StrEnum
 from functools import partial
@@ -19,12 +20,13 @@ from helpers.guard_facts import flight_settings
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import NEUTRAL
+from mavbridge.core.vehicle import ACTION_CLASSES, NEUTRAL, Reading, Sample, Telemetry
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import GuardSettings, Phase
 from mavbridge.guard.wire import (
     FromGuard,
     LastWords,
+    Samples,
     ToGuard,
     decode_from_guard,
     decode_to_guard,
@@ -32,7 +34,24 @@ from mavbridge.guard.wire import (
     read_settings,
 )
 
+CHUNK = Chunk(1, 2, 3, 4, 5, 6, 7, (NEUTRAL, NEUTRAL))
+stamps = st.integers(-(2**63), 2**63 - 1)
 numbers = st.floats(allow_nan=False)  # NaN is not equal to itself
+four = st.tuples(*[numbers] * 4)
+chunks = st.sampled_from(list(ACTION_CLASSES.values())).flatmap(
+    lambda kind: st.builds(
+        Chunk,
+        **dict.fromkeys(Chunk._fields, stamps)
+        | {"actions": st.lists(four.map(kind._make), max_size=40).map(tuple)},
+    )
+)
+readings = st.sampled_from(list(zip(Telemetry._fields, (4, 3, 3, 3, 3, 1), strict=True))).flatmap(
+    lambda quantity: st.builds(
+        Sample,
+        st.just(quantity[0]),
+        st.builds(Reading, stamps, st.tuples(*[numbers] * quantity[1]), stamps),
+    )
+)
 reasons = st.recursive(
     st.builds(because, st.sampled_from(Code), said=st.text(), ms=st.integers() | numbers),
     lambda inner: st.builds(because, st.sampled_from(Code), why=inner),
@@ -45,6 +64,8 @@ receivers = st.sampled_from((None, ("127.0.0.1", 14550), ("::1", 14550, 0, 0)))
 SAID = get_args(FromGuard)
 ERRORS = [kind for kind in SAID if issubclass(kind, Exception)]
 OF_ANY_KIND = {
+    Chunk: chunks,
+    Samples: st.builds(Samples, st.lists(readings).map(tuple)),
     LastWords: st.builds(LastWords, receiver=receivers),
     GuardTick: st.builds(GuardTick, phase=st.sampled_from(Phase)),
 }
@@ -76,7 +97,14 @@ def test_an_error_arrives_with_its_text_and_exit_status(kind: type[MavbridgeErro
     assert error.exit_code is kind.exit_code
 
 
-@pytest.mark.parametrize("data", [b"", b"\0", b"nonsense", b"N."])
+def test_numbers_of_a_chunk_arrive_bit_by_bit() -> None:
+    odd = NEUTRAL._make((1e-300, -0.0, float("inf"), float("nan")))
+    received = decode_to_guard(encode(CHUNK._replace(actions=(odd,))))
+    assert isinstance(received, Chunk)
+    assert struct.pack("<4d", *received.actions[0]) == struct.pack("<4d", *odd)
+
+
+@pytest.mark.parametrize("data", [b"", b"\0", b"nonsense", b"N.", b"C", b"R\0"])
 def test_what_is_no_message_is_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(data)
@@ -87,7 +115,7 @@ def test_what_is_no_message_is_refused(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("decode", "whole"),
     [
-        (decode_to_guard, encode(Chunk(1, 2, 3, 4, 5, 6, 7, (NEUTRAL, NEUTRAL)))),
+        (decode_to_guard, encode(CHUNK)),
         (decode_to_guard, encode(flight_settings())),
         (decode_from_guard, encode(make_guard_tick(1))),
     ],
