@@ -208,7 +208,7 @@ class DisengageSequence:
     """True if the end of our sticks triggers the vehicle's failsafe."""
     may_release: bool = False
     """True if the receiver's sticks would hold the vehicle in the flight's mode."""
-    unheld_mode: str | None = None
+    unheld_mode: str = ""
     """Mode to request after a release to sticks that would not."""
     is_thrust_mode: bool = False
     began_ns: int = 0
@@ -255,8 +255,13 @@ class DisengageSequence:
         is_deaf = now.status.mode in (*now.link.modes.setpoint, *now.link.modes.takeoff)
         if choice == "release" and (self.settings.is_setpoint or is_deaf):
             choice = "hold"
-        self.mode = _mode_of(choice, now)
-        self.unheld_mode = _mode_of("land" if is_planned else "hold", now)
+        is_lost = now.status.is_position_valid is False
+        if choice == "hold" and is_lost:
+            choice = "land"  # BRAKE and LOITER are refused without a position
+        roles = now.link.modes
+        by_choice = {"hold": roles.hold, "land": roles.land, "rtl": roles.rtl}
+        self.mode = by_choice.get(choice) or None
+        self.unheld_mode = roles.land if is_planned or is_lost else roles.hold
         return note
 
     def hand_objection(self, now: EngagementInputs) -> Reason | None:
@@ -375,12 +380,3 @@ class DisengageSequence:
         is_slow = is_late and now.link.problem is None  # each refusal prints a reason
         self.request_due_ns = now.now_ns + (SLOW_SPACING_NS if is_slow else MODE_SPACING_NS)
         return Actions(control=control, mode=self.mode)
-
-
-def _mode_of(choice: OnFault, now: EngagementInputs) -> str | None:
-    """Return the vehicle's mode for a choice; None for a release."""
-    roles = now.link.modes
-    if choice == "hold" and now.status.is_position_valid is False:
-        choice = "land"  # BRAKE and LOITER are refused without a position
-    by_choice = {"hold": roles.hold, "land": roles.land, "rtl": roles.rtl}
-    return by_choice.get(choice) or None
