@@ -115,9 +115,8 @@ def stop_signals() -> list[int]:
     background.
     """
     # SIGHUP: the terminal, or the connection to this computer, is gone.
-    names = ("SIGINT", "SIGHUP")
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    handled = [one for one in numbers if signal.getsignal(one) is not signal.SIG_IGN]
+    both = (signal.SIGINT, signal.SIGHUP)
+    handled = [one for one in both if signal.getsignal(one) is not signal.SIG_IGN]
     return [signal.SIGTERM, *handled]
 
 

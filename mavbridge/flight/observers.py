@@ -4,7 +4,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -185,15 +184,11 @@ class FlightObservers:
         meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
         params = {} if guard.summary is None else guard.summary.params
         recorder.meta = replace(meta, parameters=params)
-        self._write_end(recorder.meta, self._config.record)  # in case that it takes too long
-        recorder.close(RECORDER_JOIN_S)
-
-    def _write_end(self, meta: FlightMeta, folder: Path) -> None:
-        """Add the outcome and the vehicle's parameters to ``meta.json``."""
         try:
-            write_meta(folder, meta)
+            write_meta(self._config.record, recorder.meta)  # in case that it takes too long
         except OSError as error:
-            self.screen.show_message(f"--record {folder}: {error.strerror}")
+            self.screen.show_message(f"--record {self._config.record}: {error.strerror}")
+        recorder.close(RECORDER_JOIN_S)
 
     def finish(
         self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None

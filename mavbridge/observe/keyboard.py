@@ -8,6 +8,7 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from mavbridge.core.stopping import Worker
 
@@ -84,7 +85,9 @@ class Keyboard:
         except (OSError, termios.error):
             return  # the terminal is gone
         finally:
-            self._restore(fd)
+            with suppress(OSError, termios.error):  # the terminal may be gone
+                if self._old_modes is not None and _is_foreground(fd):
+                    termios.tcsetattr(fd, termios.TCSANOW, self._old_modes)
 
     def _take(self, fd: int) -> None:
         """Have keys delivered singly, without echo: at the start, and after Ctrl-Z and fg."""
@@ -94,13 +97,6 @@ class Keyboard:
             termios.tcflush(fd, termios.TCIFLUSH)  # keys typed before the flight must not engage it
             # TCSANOW: the other modes wait until a stopped terminal has shown all output.
             tty.setcbreak(fd, termios.TCSANOW)
-
-    def _restore(self, fd: int) -> None:
-        try:
-            if self._old_modes is not None and _is_foreground(fd):
-                termios.tcsetattr(fd, termios.TCSANOW, self._old_modes)
-        except (OSError, termios.error):
-            pass  # the terminal is gone
 
     def _read(self, fd: int) -> bool:
         """Pass on the typed keys; return False at the end of the input."""

@@ -171,21 +171,17 @@ class _News:
 
     def bring(self, solve: Solve) -> str | None:
         """Deliver the inputs that this solve had seen. Return a missing one's name, or None."""
-        self._bring_ticks(solve.started_ns)
+        while self._next_tick < len(self._ticks):
+            if (tick := self._ticks[self._next_tick]).sent_ns > solve.started_ns:
+                break
+            self._next_tick += 1
+            self._view.receive(tick)
         if not self._bring_samples(solve):
             return "the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
             if not shelf.bring(frame_id):
                 return "its image, or the feature of it"
         return None
-
-    def _bring_ticks(self, now_ns: int) -> None:
-        while self._next_tick < len(self._ticks):
-            tick = self._ticks[self._next_tick]
-            if tick.sent_ns > now_ns:
-                return
-            self._next_tick += 1
-            self._view.receive(tick)
 
     def _has_extras(self, place: int, solve: Solve) -> bool:
         """True if, after this packet, the extra inputs equal the solve's.
