@@ -121,8 +121,8 @@ def stop_signals() -> list[int]:
 
 
 def _on_signal(stop: StopRequest, noted: float) -> Callable[[int, FrameType | None], None]:
-    """Return a handler that only notes so many requests; the next one raises KeyboardInterrupt, and
-    one after that exits at once."""
+    """Return a handler that notes the first ``noted`` requests in ``stop``; the next one raises
+    KeyboardInterrupt, and the one after exits at once."""
 
     def handle(number: int, _frame: FrameType | None) -> None:
         stop.signal_number = stop.signal_number or number
