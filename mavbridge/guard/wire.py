@@ -11,8 +11,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from functools import cache
-from importlib import import_module
 from itertools import chain
 from typing import Any, BinaryIO, NamedTuple, TypeAlias, get_args
 
@@ -133,6 +131,7 @@ FromGuard: TypeAlias = (
 """Text is one line for the user; an error ends the guard."""
 
 _TO_GUARD = (FlightSettings, Chunk, Reason, str, EndRequest)
+_FROM_GUARD = get_args(FromGuard)
 
 
 def encode(message: ToGuard | FromGuard | GuardSettings) -> bytes:
@@ -160,7 +159,7 @@ def decode_to_guard(data: bytes) -> ToGuard:
 
 def decode_from_guard(data: bytes) -> FromGuard:
     """Decode a message of the guard; raise ValueError if it is malformed."""
-    message: FromGuard = _decode(data, get_args(FromGuard))
+    message: FromGuard = _decode(data, _FROM_GUARD)
     return message
 
 
@@ -221,9 +220,7 @@ class _Pickler(pickle.Pickler):
     """
 
     def reducer_override(self, value: Any) -> Any:
-        """Return how to rebuild an object; NotImplemented leaves it to pickle."""
-        if isinstance(value, tuple):  # a NamedTuple, in half of pickle's own time
-            return type(value), tuple(value)
+        """Return how to rebuild an Enum's member, or a scalar of another type; NotImplemented."""
         if not type(value).__module__.startswith("mavbridge."):
             for plain in (str, int, float):
                 if isinstance(value, plain):
@@ -237,21 +234,15 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler for our own classes."""
+    """Unpickler for our own classes: importing others, such as numpy, would stall the guard."""
 
-    def find_class(self, module: str, name: str) -> type:
+    def find_class(self, module: str, name: str) -> Any:
         """Return a class of our own, or raise UnpicklingError."""
-        return _own_class(module, name)
-
-
-@cache  # pickle's own search takes a quarter of the time of a message
-def _own_class(module: str, name: str) -> type:
-    """Return a class that a message may hold: importing others, such as numpy, would stall the
-    guard."""
-    found: object = None
-    is_plain = module == "builtins" and name in ("bool", "int", "float", "str")
-    if is_plain or module.split(".")[0] in ("mavbridge", "pathlib"):
-        found = getattr(import_module(module), name, None)
-    if not isinstance(found, type):
-        raise pickle.UnpicklingError(f"{module}.{name} is no part of a message")
-    return found
+        if module == "builtins" and name in ("bool", "int", "float", "str"):
+            return super().find_class(module, name)
+        found = None
+        if module.split(".")[0] in ("mavbridge", "pathlib") and "." not in name:
+            found = super().find_class(module, name)
+        if not isinstance(found, type):
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of a message")
+        return found
