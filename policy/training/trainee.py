@@ -27,8 +27,8 @@ reads off the condition.
 """
 LEAST_DENOISED = 16
 """Minimum number of samples per step through the denoiser."""
-VALIDATION_STEPS = 10
-"""Denoising steps of the sticks that are compared with the flown ones."""
+FLOWN_STEPS = 1
+"""Denoising steps of taught and compared sticks: as many as our own networks take in flight."""
 
 
 class Trainee(nn.Module):
@@ -62,11 +62,8 @@ class Trainee(nn.Module):
 
     @torch.no_grad()
     def teach(self, batch: Batch) -> Batch:
-        """Return the batch with this policy's own chunks where a gate is still to come.
-
-        They take one step of the solver, as the built-in policies do in flight.
-        """
-        own = self.sample(batch, 1)
+        """Return the batch with this policy's own chunks where a gate is still to come."""
+        own = self.sample(batch, FLOWN_STEPS)
         is_next = ~batch.gate[:, 0].isnan().repeat_interleave(len(own) // len(batch.gate))
         chunk = torch.where(is_next[:, None, None], own, batch.chunk)
         return replace(batch, chunk=chunk, known=batch.known | is_next[:, None])
@@ -141,8 +138,7 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
     for batch in batches:
         losses = trainee(batch).metrics
-        steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)
-        chunk = trainee.sample(batch, steps)
+        chunk = trainee.sample(batch, FLOWN_STEPS)
         held = batch.history[:, -1:].expand_as(batch.chunk)
         guesses = (chunk, trainee.stick_mean.expand_as(batch.chunk), held)
         errors = [(guess - batch.chunk).abs()[batch.known].mean() for guess in guesses]

@@ -77,7 +77,7 @@ def noted(flights: list[FlightData], settings: TrainSettings) -> tuple[TrainResu
 
 def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
     flights = [read_flight(write_spot_flight(tmp_path / str(n), n)) for n in range(4)]
-    asked = settings(tmp_path, steps=60, batch_size=16, disturb=False)
+    asked = settings(tmp_path, steps=90, batch_size=16, disturb=False)
     result = run(flights, asked)
     held_out = result.validation
     assert held_out.stick_error < 0.6 * held_out.mean_stick_error
