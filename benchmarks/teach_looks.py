@@ -34,6 +34,7 @@ from mavbridge.simulation.flight import SIM_CAMERA_PX, SimulatedFlight
 from mavbridge.simulation.world import make_vehicle
 from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import Contract, FloatArray
+from policy.engines.torch_engines import FasterThreads
 from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import fit_image
 from policy.training.batches import disturb, normalise_image
@@ -249,6 +250,7 @@ def main(
     for parameter in taught:
         parameter.requires_grad_(True)
     optimiser = torch.optim.AdamW(taught, lr=MOST_RATE, weight_decay=1e-4)
+    threads = FasterThreads(lambda: clock.now_ns() / NS_PER_S)
     begun_ns, seeds, losses = clock.now_ns(), count(FIRST_SEED), deque[float](maxlen=REPORTED)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         flights = {pool.submit(fly_and_draw, next(seeds), newest) for _ in range(workers)}
@@ -262,9 +264,10 @@ def main(
                 kept.add(flight.result())
                 flights.add(pool.submit(fly_and_draw, next(seeds), newest))
             optimiser.param_groups[0]["lr"] = MOST_RATE * learning_rate_factor(share)
-            loss = loss_of(net, kept.batch(random))
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
+            with threads.step():
+                loss = loss_of(net, kept.batch(random))
+                optimiser.zero_grad()
+                torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(taught, GRADIENT_LIMIT)
             optimiser.step()
             update_average(average, net, AVERAGED, step)

@@ -24,6 +24,8 @@ _COLLECTIONS = (list, tuple, set, deque)
 _LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
 """Packages whose objects are not searched."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
+TRIAL_EVERY, TRIAL_STEPS = 200, 4
+"""Steps from one trial of threads to the next; and in a trial, which warms up by the first two."""
 
 
 @contextmanager
@@ -35,6 +37,34 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+class FasterThreads:
+    """Uses all of torch's threads or one, whichever took a step faster in the last trial.
+
+    Threads wait for each other in every operator: on cores that other programs use too, a step of
+    a training took two threads ten times as long as one.
+    """
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s, self._steps = now_s, 0
+        self._spent_s = {torch.get_num_threads(): 0.0, 1: 0.0}
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Context manager: one of many similar steps; what follows it uses the faster number."""
+        number = self._steps % TRIAL_EVERY
+        self._steps += 1
+        if number >= TRIAL_STEPS:
+            yield
+            return
+        counts = list(self._spent_s)
+        count = counts[number % len(counts)]
+        torch.set_num_threads(count)
+        begun_s = self._now_s()
+        yield
+        self._spent_s[count] = self._now_s() - begun_s
+        torch.set_num_threads(min(counts, key=self._spent_s.__getitem__))
 
 
 def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:

@@ -12,7 +12,7 @@ import json
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from policy.data.flight_data import FlightData, hold_out
 from policy.data.frames import store_frames
 from policy.data.interpolation import Indices
-from policy.engines.torch_engines import torch_threads
+from policy.engines.torch_engines import FasterThreads, torch_threads
 from policy.errors import DatasetError, PolicyError
 from policy.training.batches import ENCODE_BATCH, FeatureStore, StepLoss, TensorBatch, ahead
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -209,10 +209,11 @@ class TrainingRun(ABC, Generic[M, B]):
 
     def finish(self) -> TrainResult:
         """Run all stages."""
-        for stage in self.stages:
-            if not stage.trains_encoder:
-                self._freeze_encoder()
-            self._train(stage)
+        with torch_threads(torch.get_num_threads()):  # trials change them
+            for stage in self.stages:
+                if not stage.trains_encoder:
+                    self._freeze_encoder()
+                self._train(stage)
         if self.step == 0:
             raise TrainingError("the time was over before the first step: give more --minutes")
         self._validate(self.stages[-1])
@@ -247,12 +248,17 @@ class TrainingRun(ABC, Generic[M, B]):
         self._stage_step, self._stage_start = self.step, self._fraction
         optimiser = self._new_optimiser(stage)
         sums: dict[str, Tensor] = {}
+        # Sums of other threads differ in the last bit: equal runs by --steps stay equal.
+        is_tried = self.settings.steps is None and self.device.type == "cpu"
+        threads = FasterThreads(self.hooks.now_s).step if is_tried else nullcontext
         self.trainee.train()
         self.encoder(self.trainee).train(stage.trains_encoder)
         with closing(ahead(self.batch_maker(), self.step)) as batches:
             since = 0
             while self._fraction < stage.end:
-                metrics = self._set_gradients(next(batches).to(self.device))
+                batch = next(batches).to(self.device)
+                with threads():
+                    metrics = self._set_gradients(batch)
                 # On cores shared with another program, threads that wait for each other in every
                 # small operator of this took a hundred times the processor time of one.
                 with torch_threads(1):

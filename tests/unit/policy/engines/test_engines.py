@@ -8,7 +8,7 @@ import torch
 
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
-from policy.engines.torch_engines import make_torch_runner
+from policy.engines.torch_engines import FasterThreads, make_torch_runner, torch_threads
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
@@ -110,3 +110,16 @@ def test_arrays_are_copied_in_and_out() -> None:
     runner.act(feature, state, HISTORY)
     np.testing.assert_array_equal(feature, before)
     assert (state == 1).all()
+
+
+@pytest.mark.parametrize(("all_s", "one_s", "kept"), [(1.0, 1.5, 3), (9.0, 1.5, 1)])
+def test_steps_use_the_number_of_threads_that_took_less_time(all_s, one_s, kept) -> None:
+    now_s, used = [0.0], []
+    with torch_threads(3):
+        threads = FasterThreads(lambda: now_s[0])
+        for _ in range(20):
+            with threads.step():
+                used.append(torch.get_num_threads())
+                now_s[0] += all_s if used[-1] == 3 else one_s
+        assert used == [3, 1, 3, 1] + [kept] * 16
+        assert torch.get_num_threads() == kept
