@@ -112,11 +112,14 @@ class Memory:
         is_chosen = now.status.is_mode_chosen and now.status.mode != self.released_mode
         if (now.status.stick_loss_ns or 0) <= self.released_ns or is_chosen:
             return None  # a geofence, a battery, or a pilot who wants Hold
-        modes = now.link.modes
-        has_fallback = bool(modes.override) and not modes.is_silence_failsafe
-        is_dropped = now.status.is_failsafe and now.status.armed and now.status.mode == modes.hold
+        is_dropped = now.status.is_failsafe and now.status.mode == now.link.modes.hold
+        return self.released_mode if is_dropped and self.may_lose_mode(now) else None
+
+    def may_lose_mode(self, now: EngagementInputs) -> bool:
+        """True if PX4 may yet fall into that failsafe."""
+        has_fallback = bool(now.link.modes.override) and not now.link.modes.is_silence_failsafe
         is_recent = now.now_ns - self.released_ns <= LATE_NS and not self.settings.is_setpoint
-        return self.released_mode if has_fallback and is_dropped and is_recent else None
+        return has_fallback and is_recent and now.status.armed and self.released_mode is not None
 
     def unheld(self, now: EngagementInputs) -> Reason | None:
         """Return why the released sticks do not hold the vehicle, if they were to hold it.

@@ -206,9 +206,10 @@ def released(m: Memory, now: EngagementInputs) -> bool:
     """the vehicle shows sticks other than ours, or 1 s has passed
 
     30 s with a receiver, else 4 s, if it does not even show our last sticks; the outcome then says
-    that the release was not seen. PX4's failsafe for lack of sticks is undone first, for 1.5 s.
+    that the release was not seen. For 1.5 s PX4's failsafe for lack of sticks is undone first.
     """
-    if m.lost_mode(now) is not None:
+    is_own_mode = now.status.mode == m.released_mode
+    if m.lost_mode(now) is not None or (is_own_mode and m.may_lose_mode(now)):
         return False
     if now.link.is_released and not m.owes_release:
         return True

@@ -253,16 +253,24 @@ def test_a_px4_that_falls_back_to_its_receiver_is_flown_by_it_after_an_end_or_th
     assert not flight.samples[-1].failsafe
 
 
-@pytest.mark.parametrize("end", [OutputFlight.die, OutputFlight.stop])
+def put_switch_low(flight: OutputFlight) -> None:
+    flight.vehicle.set_receiver((1500, 1500, 1500, 1500, 1000))
+
+
+@pytest.mark.parametrize("end", [OutputFlight.die, OutputFlight.stop, put_switch_low])
 def test_a_px4_whose_receiver_rests_gets_its_mode_back_after_its_failsafe(
     end: Callable[[OutputFlight], None],
 ) -> None:
     """It reads a resting receiver every 0.3 s: after three ends of eight it saw no sticks."""
     modes, failsafes = set(), 0
     for wait_s in (0.0, 0.08, 0.16, 0.24):
-        flight = OutputFlight("px4", "sticks")
-        fall_back(flight, 1500, 1500, 1500, 1500)
-        flight.fly(1.2 + wait_s)
+        flight = OutputFlight("px4", "sticks", engage_channel=5)
+        fall_back(flight, 1500, 1500, 1500, 1500, 1000)
+        flight.launch().run(0.3)
+        flight.vehicle.set_receiver((1500, 1500, 1500, 1500, 2000))
+        flight.until(lambda: flight.phase is Phase.FLYING, within_s=1.0)  # noqa: B023
+        flight.begin_program()
+        flight.run(1.2 + wait_s)
         end(flight)
         flight.run(2.0)
         modes.add((flight.px4.mode_name, flight.px4.stick_input.source))
@@ -304,7 +312,7 @@ def test_unheard_sticks_are_followed_by_a_hold_and_only_by_a_pilot_whose_hand_is
     silence(flight, up_s=4.0)
     if is_moved:
         later(flight, 3.5, lambda: flight.vehicle.set_receiver((1700, 1500, 1500, 1500)))
-    flight.run(5.0)
+    flight.run(5.5)
     mode = flight.mode if is_moved else "AUTO.LOITER" if flight.is_px4 else "BRAKE"
     assert flight.samples[-1].mode == mode, flight.describe()
     is_held = flight.is_px4 and not is_moved
