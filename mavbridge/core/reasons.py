@@ -141,7 +141,9 @@ class Code(StrEnum):
         "firewall, or a full queue"
     )
     UNHEARD = _vehicle("the vehicle does not hear our {quantity}")
-    NO_ECHO = _vehicle("no {message} arrives, so our {quantity} cannot be checked")
+    NO_ECHO = _vehicle(
+        "no {message} arrives: the vehicle does not hear our {quantity}, or does not show them"
+    )
     LATE_SENDING = _vehicle("our packets take {age_ms:.0f} ms or more to reach the vehicle")
     READING_PARAMETERS = _waiting(
         "reading the vehicle's parameters: if this lasts, check port, baud rate and signing"
