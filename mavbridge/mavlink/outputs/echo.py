@@ -213,8 +213,8 @@ class EchoCheck:
                 self._baseline = values  # perhaps a source that rests as it did before ours
             if _is_often(self._foreign_us, shown_us):
                 self._fail("foreign", now_ns, is_hand=rules.hand > 0 and before is not None)
-        elif _is_often(self._returned_us, shown_us):
-            self._fail("returned", now_ns)
+        elif (was_held := self._is_held(shown_us)) or _is_often(self._returned_us, shown_us):
+            self._fail("silent" if was_held else "returned", now_ns)
         if self.confirmed or is_held:
             self._watch_change(values, shown_us, now_ns)
 
@@ -243,9 +243,13 @@ class EchoCheck:
         if values != self._held:
             self._held, self._held_since_us, self._held_samples = values, shown_us, 0
         self._held_samples += 1
-        held_us = shown_us - self._held_since_us
-        if self._held_samples >= self._rules.silent_samples and held_us >= self._rules.silent_us:
+        if self._is_held(shown_us):
             self._fail("silent", now_ns)
+
+    def _is_held(self, shown_us: int) -> bool:
+        """True if the last shown values had been constant for too long by then."""
+        is_shown = self._held is not None and self._held_samples >= self._rules.silent_samples
+        return is_shown and shown_us - self._held_since_us >= self._rules.silent_us
 
     def _fail(self, fault: EchoFault, now_ns: int, *, is_hand: bool = False) -> None:
         """Note a fault; of several in a row a hand counts, else the first, the likely cause."""

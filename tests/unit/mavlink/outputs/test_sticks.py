@@ -139,6 +139,35 @@ def test_what_px4_acts_on_instead_of_our_sticks_is_told(
     assert flight.now_ns - since_ns < 500 * MS
 
 
+@pytest.mark.parametrize("first_ms", range(10, 200, 20))
+@pytest.mark.parametrize(
+    ("shown", "code"),
+    [((0, 0, 0, 0), Code.UNHEARD), ((300, 0, 0, 0), Code.OVERRULED)],
+    ids=["at rest", "in a hand"],
+)
+def test_a_px4_that_misses_us_and_follows_its_receiver_is_no_takeover_unless_a_hand_is_seen(
+    first_ms: int, shown: tuple[int, ...], code: Code
+) -> None:
+    """It shows our last for 0.5 s, every 200 ms, and once a second more often, then a receiver's.
+
+    Taken for a takeover, it was released to an idle throttle.
+    """
+    flight = px4_flight()
+    flight.receive(ManualControl(0, 0, 0, 0))
+    for _ in range(50):
+        echo(flight, WANTED)
+    since_ns, last = flight.now_ns, flight.message(flight.send(WANTED))
+    held = ManualControl(last.x, last.y, last.z, last.r)
+    due = [(at_ms, held) for at_ms in range(first_ms, 500, 200)]
+    due += [(due[-1][0] + 200 + more_ms, ManualControl(*shown)) for more_ms in (0, 200, 400)]
+    flight.receive(held)
+    for at_ms, values in due:
+        while flight.now_ns < since_ns + at_ms * MS:
+            flight.send(WANTED._replace(roll=0.3 - at_ms / 1000))
+        flight.receive(values)
+    assert flight.problem.code is code
+
+
 NEUTRAL_SENT = (0, 0, 500, 0)
 
 
