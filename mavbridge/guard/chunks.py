@@ -191,7 +191,8 @@ class ChunkBuffer:
             uncovered_ns = self._uncovered_ns + gap_ns if gap_ns > 0 else 0
             self._uncovered_ns = min(uncovered_ns, LEAST_GRACE_NS)
         self.newest, self._taken_ns, self._end_ns = chunk, now_ns, end_ns
-        limited_ns = max(now_ns, min(self._stale_ns(chunk), end_ns)) + LEAST_GRACE_NS
+        limits_ns = (happened_ns + limit_ns for _, happened_ns, limit_ns in self._ages(chunk))
+        limited_ns = max(now_ns, min(end_ns, *limits_ns)) + LEAST_GRACE_NS
         self._grace_until_ns = min(now_ns + self.grace_ns, limited_ns - self._uncovered_ns)
         self._until_ns = self._grace_until_ns
         if max(self._gaps_ns, default=0) <= self.grace_ns:  # no second stall soon after one
@@ -345,10 +346,6 @@ class ChunkBuffer:
             ("image", chunk.image_ns, limits.feature_ns),
             ("chunk", chunk.computed_ns, limits.chunk_ns),
         )
-
-    def _stale_ns(self, chunk: Chunk) -> int:
-        """Return the last moment at which a chunk is within its age limits."""
-        return min(happened_ns + limit_ns for _, happened_ns, limit_ns in self._ages(chunk))
 
     def _stale(self, chunk: Chunk, now_ns: int) -> Reason | None:
         for name, happened_ns, limit_ns in self._ages(chunk):

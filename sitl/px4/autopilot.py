@@ -109,8 +109,9 @@ class Px4(Commander):
             has_position=self.position_ready,
         )
         height_m = -self.sensed.position_ned_m[2]
-        if height_m >= self.flight.takeoff_to_m - TAKEOFF_MARGIN_M:
-            self.finish_takeoff()
+        is_up = height_m >= self.flight.takeoff_to_m - TAKEOFF_MARGIN_M
+        if is_up and self.intended is Px4Mode.AUTO_TAKEOFF:
+            self._intend(Px4Mode.AUTO_LOITER)
         return commands
 
     def _leaves_ground(self) -> bool:

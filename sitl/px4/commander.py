@@ -149,10 +149,6 @@ class Commander(Autopilot):
         self._intend(mode)
         return True
 
-    def finish_takeoff(self) -> None:
-        if self.intended is Px4Mode.AUTO_TAKEOFF:
-            self._intend(Px4Mode.AUTO_LOITER)
-
     def _set_landed(self, *, landed: bool) -> None:
         super()._set_landed(landed=landed)
         self._landed_ns = self.now_ns

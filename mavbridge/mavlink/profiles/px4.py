@@ -233,8 +233,7 @@ class Px4(Profile):
             )
             yield from _exception_notes(values, _EXCEPT_OFFBOARD, "OFFBOARD")
             if values.get("COM_OBL_RC_ACT") == 0:
-                effect = ": when setpoints end it enters POSCTL; without sticks it returns, or "
-                effect += "lands (before 1.18)"
+                effect = ": when setpoints end it enters POSCTL; without sticks it may RTL or land"
                 yield ParamNote.of("hint", "COM_OBL_RC_ACT", 0, effect, 4, " (land), or 5 (hold)")
 
     def stick_curves(

@@ -244,7 +244,10 @@ class VehicleParams:
                 is_complete=not self._open,
                 is_disarmed=status is not None and not status.armed,
             ):
-                yield self._as_written(request)
+                if isinstance(request, ParamWrite) and self._profile.is_bytewise:
+                    kind = self._kinds.get(request.name, request.kind)
+                    request = request._replace(kind=kind).as_bytes()
+                yield request
         if self._follow_up and self._follow_ups_left and now_ns >= self._follow_up_ns:
             self._follow_ups_left, self._follow_up_ns = self._follow_ups_left - 1, now_ns + NS_PER_S
             yield self._follow_up
@@ -274,12 +277,6 @@ class VehicleParams:
                 continue
             self._open[name] = (now_ns, attempts + 1)
             yield ParamRequest(name)
-
-    def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
-        """Return a write with the type that the firmware demands, if any."""
-        if isinstance(request, ParamRequest) or not self._profile.is_bytewise:
-            return request
-        return request._replace(kind=self._kinds.get(request.name, request.kind)).as_bytes()
 
     def _ask_for_missing(self, now_ns: int, status: VehicleStatus | None) -> None:
         """Request missing parameters, on the ground: the needed ones in every round, all in rounds
