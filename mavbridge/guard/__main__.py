@@ -1,8 +1,8 @@
 """Guard process: ``python -m mavbridge.guard FD FD``, started by the flight process.
 
-Its settings come on standard input. It prints nothing, since a reader of its output might block it.
-Messages and errors go through the channel (the first file descriptor), the vehicle's readings
-through the second.
+Its settings come on standard input. Messages and errors go through the channel (the first file
+descriptor), the vehicle's readings through the second. It prints nothing, since a reader of its
+output might block it, but for a line to a terminal whose flight process has died.
 """
 
 import os
@@ -10,7 +10,9 @@ import signal
 import socket
 import sys
 import traceback
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
 
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
@@ -35,6 +37,7 @@ LAST_WORDS_S = 2.0
 LEAD_NS = 150 * NS_PER_MS // 1000
 """Time from the decision to its slot [ns]: the least time that the work before a send takes.
 A chunk that arrives in between waits for the slot, so a longer lead would delay chunks."""
+_UNBLOCKED = os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK
 _SURVIVED = ("SIGINT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU")
 """Terminal signals that end or stop the flight process, and that the guard ignores."""
 
@@ -76,6 +79,8 @@ def _run(settings: GuardSettings, port: SocketPort, samples: SocketPort, stack: 
         signing=signing,
     )
     loop = GuardLoop(clock, link, port, samples=samples, lead_ns=LEAD_NS)
+    with suppress(OSError):  # there is no /proc on macOS
+        loop.say = partial(say_on, Path(f"/proc/{os.getppid()}/fd/2").readlink())
     told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     # After the link is open: the first message tells the flight process so.
@@ -97,6 +102,14 @@ def _run(settings: GuardSettings, port: SocketPort, samples: SocketPort, stack: 
         dropped_packets=log.dropped if log else 0,
     )
     port.finish(encode(summary), LAST_WORDS_S)
+
+
+def say_on(terminal: Path, text: str) -> None:
+    """Write a line to a terminal, and show its cursor again; nothing if that would block."""
+    plain = "".join(letter if letter.isprintable() else "?" for letter in text)
+    with suppress(OSError), os.fdopen(os.open(terminal, _UNBLOCKED), "wb", buffering=0) as stream:
+        if stream.isatty():
+            stream.write(f"\r\n{plain}\r\n\x1b[?25h".encode())
 
 
 if __name__ == "__main__":

@@ -78,6 +78,8 @@ class GuardLoop:
             lead_ns: time from the start of a computation to its slot; the send waits for the slot.
             watch_input: called with the time and the input of each step of the guard.
         """
+        self.say: Callable[[str], object] = lambda text: None
+        """Called with the announcements that the flight process cannot show any more."""
         self._watch_input = watch_input
         self._lead_ns = lead_ns
         self._clock = clock
@@ -380,3 +382,5 @@ class GuardLoop:
                 text = f"control given back: {reason}"
         if text is not None:
             self._link.announce(f"mavbridge: {text}")
+            if self._flight.is_closed:
+                self.say(f"mavbridge: {text}")

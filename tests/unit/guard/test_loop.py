@@ -1,5 +1,8 @@
 """The guard between a vehicle and a flight process of fakes."""
 
+import os
+import termios
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +14,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.ticks import GuardTick
 from mavbridge.core.vehicle import IDLE, NEUTRAL, ForwardedPacket, LinkArrivals, Sticks
+from mavbridge.guard.__main__ import say_on
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
@@ -66,7 +70,9 @@ class Rig:
         self.clock = FakeClock(oversleep_ns=oversleep_ns)
         self.link = FakeLink(self.clock, **status)
         self.port = FakePort()
+        self.said: list[str] = []
         self.loop = GuardLoop(self.clock, self.link, self.port, lead_ns=lead_ns)
+        self.loop.say = self.said.append
         self.solves = True
         self.serial = 0
 
@@ -312,6 +318,34 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
     rig.port.is_closed = True
     rig.loop.step()
     assert rig.link.decisions[-1][1] == NEUTRAL
+
+
+def test_what_a_dead_flight_process_cannot_show_is_said_on_its_terminal() -> None:
+    rig = Rig(has_receiver=False).flying()
+    assert rig.said == []
+    rig.port.is_closed = True
+    rig.run(0.5)
+    rig.link.change(mode="LOITER")
+    rig.run(0.5)
+    assert rig.said == rig.link.announced[1:]
+    assert rig.said[0] == "mavbridge: neutral: the flight process has died"
+    assert rig.said[-1].startswith("mavbridge: control given back: the flight process has died")
+
+
+def test_a_terminal_that_shows_nothing_more_does_not_hold_the_guard_up(tmp_path: Path) -> None:
+    reader, terminal = os.openpty()
+    name = Path(os.ttyname(terminal))
+    say_on(name, "a\x1b[2J\nb")
+    assert os.read(reader, 1024).split() == [b"a?[2J?b", b"\x1b[?25h"]
+    termios.tcflow(terminal, termios.TCOOFF)  # Ctrl-S
+    for _ in range(200):
+        say_on(name, "x" * 1000)
+    os.close(reader)
+    os.close(terminal)
+    (file := tmp_path / "log").write_text("as it was")
+    for other in (name, Path("pipe:[7]"), file):
+        say_on(other, "nobody")
+    assert file.read_text() == "as it was"
 
 
 def test_a_message_that_cannot_be_read_ends_the_flight_and_not_the_guard() -> None:
