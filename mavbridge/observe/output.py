@@ -94,7 +94,7 @@ def patient_console(*, stderr: bool = True) -> Console:
 
 
 class _SurvivingText(io.TextIOWrapper):
-    """Text stream that goes to the null device once its reader or terminal is gone."""
+    """Text stream that goes to the null device once it takes no more, as on a full disk."""
 
     def write(self, text: str, /) -> int:
         try:
@@ -110,14 +110,14 @@ class _SurvivingText(io.TextIOWrapper):
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> None:
-        if error.errno not in (errno.EPIPE, errno.EIO):
-            raise error
         with Path(os.devnull).open("wb") as null:
             os.dup2(null.fileno(), self.fileno())
+        if error.errno not in (errno.EPIPE, errno.EIO):  # its reader or terminal is not gone
+            sys.stderr.write(f"warning: the output is cut short: {error.strerror}\n")
 
 
 def survive_lost_readers() -> None:
-    """Let standard output and error outlive their reader, so that a command finishes its files."""
+    """Let standard output and error outlive their reader or disk: a command finishes its files."""
     for name in ("stdout", "stderr"):
         old = getattr(sys, name)
         buffer = io.BufferedWriter(io.FileIO(old.fileno(), "wb", closefd=False))

@@ -92,3 +92,11 @@ def test_a_file_does_not_take_the_place_of_a_closed_stream(closed: str, tmp_path
     command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", code]
     subprocess.run(command, cwd=tmp_path, env=child_environment(), check=True)
     assert int((tmp_path / "number").read_text()) > 2
+
+
+def test_a_full_disk_under_an_output_is_told_and_fails_nobody_who_prints() -> None:
+    code = "from mavbridge.observe.output import survive_lost_readers; survive_lost_readers(); "
+    code += "print('lost'); print('on')"
+    command = ["sh", "-c", 'exec "$@" >/dev/full', "sh", sys.executable, "-c", code]
+    ended = subprocess.run(command, env=child_environment(), capture_output=True, check=True)
+    assert ended.stderr == b"warning: the output is cut short: No space left on device\n"
