@@ -98,10 +98,11 @@ def user_code(doing: str) -> Iterator[None]:
         raise
     except BaseException as error:
         is_main = threading.current_thread() is threading.main_thread()
-        if isinstance(error, GeneratorExit) or (isinstance(error, KeyboardInterrupt) and is_main):
+        if isinstance(error, KeyboardInterrupt) and is_main:
             raise
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        told = lines[-1] if "Traceback" in str(error) else " ".join(lines)
+        said = str(traceback.TracebackException(type(error), error, None))  # its own may raise
+        lines = [line.strip() for line in said.splitlines() if line.strip()]
+        told = lines[-1] if "Traceback" in said else " ".join(lines)
         raise PolicyError(f"{doing}: {type(error).__name__}: {told}{user_line(error)}") from error
 
 

@@ -140,6 +140,8 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
         ("raise ValueError('no camera here')", r"ValueError: no camera here \(.*broken\.py:1\)"),
         ("raise SystemExit('no')", r"SystemExit: no \(.*broken\.py:1\)"),
         ("import asyncio; raise asyncio.CancelledError('no')", r"CancelledError: no \("),
+        ("raise GeneratorExit('no')", r"GeneratorExit: no \("),
+        ("class E(Exception):\n  __str__ = None\nraise E", r"E: .*str\(\) failed.*broken\.py:3\)"),
         ("import no_such_library", "install no_such_library beside mavbridge"),
         ("from .neighbour import VALUE", "import its neighbours by their plain names"),
         (
