@@ -252,7 +252,7 @@ class Code(StrEnum):
     )
     UNUSABLE_CHUNKS = _fault("the policy returned {chunks} unusable chunks in a short time: {why}")
     POLICY_REFUSED = _fault("{said}")
-    NO_READING = _waiting("no {quantity} from the vehicle yet")
+    NO_READING = _waiting("no new {quantity} from the vehicle")
     NO_TRUSTED_READING = _waiting("no {quantity} from the vehicle yet, or none that it trusts")
     READING_AHEAD = _vehicle("{quantity} is stamped {ahead_ms:.0f} ms ahead of the vehicle's clock")
     ATTITUDE_FROZEN = _vehicle(

@@ -26,6 +26,7 @@ from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
 from policy.contract import ACTION_DIM
 from policy.errors import NoChunkError
+from policy.files import last_line
 from policy.motion.forward_motion import ForwardMotion, VehicleMotion
 from policy.protocol import PolicyRunner
 
@@ -226,7 +227,7 @@ class PolicyLoop:
         try:
             array = self._runner.act(observation.encoded, observation.states, history)
         except NoChunkError as error:
-            self._refuse(because(Code.POLICY_REFUSED, said=str(error)))
+            self._refuse(because(Code.POLICY_REFUSED, said=last_line(error)))
             return
         done_ns = self._clock.now_ns()
         if array.shape != (1, self._horizon, ACTION_DIM):

@@ -27,7 +27,7 @@ def require_goal(config: FlyConfig, contract: Contract) -> None:
     if "goal" in contract.state_extras and config.goal is None:
         raise UserError(
             "this policy flies to a goal: give --goal NORTH,EAST,DOWN, in metres from the "
-            "estimator's origin"
+            "estimator's origin (evaluate has none)"
         )
     if "goal" not in contract.state_extras and config.goal is not None:
         raise UserError(

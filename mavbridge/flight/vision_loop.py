@@ -19,6 +19,7 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from policy.errors import NoChunkError
+from policy.files import last_line
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
 """Longest wait for a frame between two checks of the stop flag."""
@@ -102,7 +103,7 @@ class VisionLoop:
             try:
                 value = self.encode(frame.rgb, self.number)
             except NoChunkError as error:  # the last feature ages, up to its limit
-                self.cache.refusal = fault = because(Code.POLICY_REFUSED, said=str(error))
+                self.cache.refusal = fault = because(Code.POLICY_REFUSED, said=last_line(error))
             finally:
                 self.encoding_since_ns = None
         ready_ns = self.clock.now_ns()

@@ -84,19 +84,24 @@ def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(is_watched):
     assert len(sink.visions) == 4 * NS_PER_S // FRAME_NS + 1
 
 
-def test_an_image_that_the_policy_skips_leaves_the_last_feature_and_a_reason():
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [("too dark", "too dark"), ("", "NoChunkError"), ("why:\n" + "x" * 9999, "x" * 300)],
+    ids=["a line", "nothing", "a page"],
+)
+def test_an_image_that_the_policy_skips_leaves_the_last_feature_and_a_reason(words, said):
     clock, cache, sink, seen = FakeClock(), FeatureCache(), ListSink(), []
 
     def encode(rgb, camera):
         if clock.now_ns() == START_NS + 2 * FRAME_NS:
-            raise NoChunkError("too dark")
+            raise NoChunkError(words)
         return np.zeros((1, 8), np.float32)
 
     loop = make_loop(clock, StillCamera(clock, SCENE), cache=cache, encode=encode, sink=sink)
     for _ in range(3):
         loop.step()
         seen.append((cache.latest().frame_id, cache.refusal, loop.encoding_since_ns))
-    dark = because(Code.POLICY_REFUSED, said="too dark")
+    dark = because(Code.POLICY_REFUSED, said=said)
     assert seen == [(1, None, None), (1, dark, None), (3, None, None)]
     assert [vision.fault for vision in sink.visions] == [None, dark, None]
     assert [vision.feature is None for vision in sink.visions] == [False, True, False]
