@@ -10,7 +10,7 @@ from shutil import rmtree
 from mavbridge.commands.demonstrate_pilot import Pilot, Variation, draw_variation
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
-from mavbridge.config.episodes import DemonstrateConfig
+from mavbridge.config.episodes import COURSE_SEEDS, MAX_EPISODES, DemonstrateConfig
 from mavbridge.config.policy import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
@@ -211,8 +211,9 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
     """Return the episodes without a finished recording; raise if a folder holds anything else."""
     weights = digests(policy_files(config.policy)) if config.has_student else {}
     specs = []
+    first = COURSE_SEEDS[config.courses] + config.policy.seed * MAX_EPISODES  # never evaluated
     for index in range(config.episodes):
-        folder, seed = config.out / f"{index:06d}", config.first_course_seed + index
+        folder, seed = config.out / f"{index:06d}", first + index
         spec = DemonstrationSpec(folder=folder, seed=seed, config=config, weights=weights)
         if folder.is_dir() and any(folder.iterdir()):
             if not (folder / META).is_file():

@@ -157,7 +157,8 @@ def _fly_on_ray(
         *(errors.OutOfMemoryError, errors.ObjectLostError),
     )
     try:
-        submit = [lambda job: task.remote(job, _never).future()] * count
+        # Ray cancels a task itself when the connection ends.
+        submit = [lambda job: task.remote(job, lambda: False).future()] * count
         yield from _collect(submit, jobs, should_stop, lost)
     except errors.RayTaskError as error:
         if isinstance(error.cause, MavbridgeError):
@@ -165,11 +166,6 @@ def _fly_on_ray(
         raise  # a bug: keep its traceback
     finally:
         ray.shutdown()
-
-
-def _never() -> bool:
-    """Never stop: Ray cancels a task itself when the connection ends."""
-    return False
 
 
 def _require_reachable(address: str) -> None:

@@ -161,8 +161,3 @@ class DemonstrateConfig(Ranged):
     def has_student(self) -> bool:
         """True if a policy flies; a built-in network needs ``checkpoint`` for that."""
         return self.policy.checkpoint is not None or self.policy.kind not in BUILTIN_KINDS
-
-    @property
-    def first_course_seed(self) -> int:
-        """Course of the first flight. Training and evaluation never fly these courses."""
-        return COURSE_SEEDS[self.courses] + self.policy.seed * MAX_EPISODES

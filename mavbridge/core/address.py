@@ -120,12 +120,8 @@ def resolve(host: str, port: int) -> SocketAddress:
     except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "no such name"
         raise UserError(f"cannot find host {host!r}: {reason}") from error
-    return socket_address(*min(found, key=len))
-
-
-def socket_address(host: str | int, port: int | bytes, *scope: int) -> SocketAddress:
-    """Return a ``SocketAddress`` of these parts."""
-    return (str(host), int(port), *scope)
+    name, number, *scope = min(found, key=len)
+    return (str(name), int(number), *scope)
 
 
 def family(address: SocketAddress) -> socket.AddressFamily:

@@ -262,7 +262,8 @@ class ObservationSource:
         rows = []
         for before_ns, feature in zip(self._before_ns, features, strict=True):
             at_ns = state.attitude_ns - before_ns
-            past = state if before_ns == 0 else _nearest(known, at_ns)
+            nearest = min(known, key=lambda each: abs(each.attitude_ns - at_ns))
+            past = nearest if before_ns else state
             rows.append(self._with_motion(past, feature)[0])
         return np.stack(rows)[None]
 
@@ -295,10 +296,6 @@ def keeps_past(plan: FlightPlan) -> bool:
     """
     is_sparse = plan.guard.chunk_period_ns > SPARSE_NS
     return plan.contract.observation_steps > 1 or (plan.contract.since_exposure and is_sparse)
-
-
-def _nearest(states: Sequence[VehicleState], at_ns: int) -> VehicleState:
-    return min(states, key=lambda state: abs(state.attitude_ns - at_ns))
 
 
 def motion_since(exposed_ns: int, state: VehicleState, known: Sequence[VehicleState]) -> FloatArray:

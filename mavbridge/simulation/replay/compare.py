@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
 from mavbridge.core.ticks import GuardTick
-from mavbridge.core.vehicle import Action, ActionTrace
+from mavbridge.core.vehicle import ActionTrace
 from mavbridge.recording.rows import attributes
 from mavbridge.simulation.replay.guard import GuardStep
 from mavbridge.simulation.replay.policy import SolvePair
@@ -193,12 +193,11 @@ def _other_results(step: GuardStep) -> list[str]:
 def _results(tick: GuardTick) -> dict[str, object]:
     """Return the results of a pass by name, in single precision, that of a recording."""
     stages = {stage: getattr(tick.trace, stage, None) for stage in ActionTrace._fields}
-    actions = {name: _single(action) for name, action in (stages | {"sent": tick.sent}).items()}
+    actions = {
+        name: action and np.array(action, np.float32).tolist()
+        for name, action in (stages | {"sent": tick.sent}).items()
+    }
     return {"phase": tick.phase, "chunk": tick.chunk_serial, **actions}
-
-
-def _single(action: Action | None) -> list[float] | None:
-    return None if action is None else np.array(action, np.float32).tolist()
 
 
 def stick_traces(steps: Sequence[GuardStep], replayed: Iterable[GuardTick | None]) -> StickTraces:

@@ -163,7 +163,8 @@ class _News:
         for samples, telemetry in samples_of(flown):
             self._samples.append(samples)
             self._telemetry.append(telemetry)
-        self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
+        stamps = [[each.happened_ns if each else 0 for each in t.motion] for t in self._telemetry]
+        self._stamps = np.array(stamps).reshape(-1, 4)
         self._reader = StateReader(recorded_plan(source))
         self._next = 0
         self._ticks = source.ticks
@@ -207,8 +208,3 @@ class _News:
         self._view.receive(Samples(sum(self._samples[self._next : end], ())))
         self._next = end
         return True
-
-
-def _stamps_ns(now: Telemetry) -> list[int]:
-    """Return the stamps of attitude, rate, velocity and specific force; 0 if missing."""
-    return [0 if reading is None else reading.happened_ns for reading in now.motion]
