@@ -3,7 +3,8 @@
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Generic, Protocol, TypeVar
 
 from mavbridge.core.errors import MavbridgeError
@@ -133,33 +134,42 @@ class ObserverThread:
 
     def _run(self, consumer: Consumer) -> None:
         try:
-            while not self._out_of_time.is_set():
-                is_last_round = self._closing.wait(BATCH_PERIOD_S)
-                batch = self._ticks.take(BATCH_EVENTS)
-                for queue in (self._solves, *self._visions):
-                    batch += queue.take(BATCH_EVENTS)
-                if batch:
-                    self._in_flight = len(batch)
-                    consumer.consume(batch)
-                    self._in_flight = 0
-                elif is_last_round:
-                    return
+            with self._failing():
+                self._pass_events(consumer)
+        finally:
+            self._open = False
+            with self._failing():
+                consumer.close()
+
+    def _pass_events(self, consumer: Consumer) -> None:
+        while not self._out_of_time.is_set():
+            is_last_round = self._closing.wait(BATCH_PERIOD_S)
+            batch = self._ticks.take(BATCH_EVENTS)
+            for queue in (self._solves, *self._visions):
+                batch += queue.take(BATCH_EVENTS)
+            if batch:
+                self._in_flight = len(batch)
+                consumer.consume(batch)
+                self._in_flight = 0
+            elif is_last_round:
+                return
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """Context manager: keep the reason of an error; raise a bug again, for its traceback."""
+        try:
+            yield
         except (MavbridgeError, OSError) as error:
             self._fail(str(error))
         except Exception as bug:
             self._fail(f"bug: {bug!r}")
             raise
-        finally:
-            self._open = False
-            try:
-                consumer.close()
-            except (MavbridgeError, OSError) as error:
-                self._fail(str(error))
 
     def _fail(self, reason: str) -> None:
         if self.failure is None:
             self.failure = reason
-            _log.warning("%s stopped: %s; the flight goes on without it", self._name, reason)
+            after = "" if self._closing.is_set() else "; the flight goes on without it"
+            _log.warning("%s stopped: %s%s", self._name, reason, after)
 
 
 class FanOut:

@@ -109,14 +109,22 @@ def test_a_bug_in_the_consumer_shows_its_traceback_and_does_not_reach_the_loop()
     assert observer.dropped == 3, "events after the end count"
 
 
-def test_an_error_while_finishing_is_reported() -> None:
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize(
+    ("error", "failure"),
+    [(OSError("disk full"), "disk full"), (ValueError("oops"), "bug: ValueError('oops')")],
+)
+def test_an_error_while_finishing_is_reported(
+    error: Exception, failure: str, caplog: pytest.LogCaptureFixture
+) -> None:
     class FailsToFinish(Recorder):
         def close(self) -> None:
-            raise OSError("disk full")
+            raise error
 
     observer = observing(FailsToFinish(), capacity=10)
     observer.close(DEADLINE_S)
-    assert observer.failure == "disk full"
+    assert observer.failure == failure
+    assert [record.getMessage() for record in caplog.records] == [f"viewer stopped: {failure}"]
 
 
 def test_close_gives_up_on_a_consumer_that_hangs() -> None:
