@@ -5,6 +5,7 @@ Reads of devices and streams block, so they run behind a `Grabber`.
 
 import math
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -33,6 +34,8 @@ SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
 """Modes of practically every camera; the smallest that covers the policy's image is used."""
+_opening = threading.Lock()
+"""Held while OpenCV reads its options from the environment, which all cameras share."""
 
 
 @dataclass(slots=True)
@@ -127,13 +130,14 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
     of a stream joined between two key frames.
     """
     wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: "-8"}
-    added = {name: value for name, value in wanted.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
+    with _opening:
+        added = {name: value for name, value in wanted.items() if name not in os.environ}
+        os.environ.update(added)
+        try:
+            yield
+        finally:
+            for name in added:
+                del os.environ[name]
 
 
 def retrieve_rgb(capture: cv2.VideoCapture) -> CameraImage | None:
@@ -177,7 +181,8 @@ class VideoFileCamera:
         """Open the file. Raises CameraError if OpenCV cannot decode its first frame."""
         self._path = path
         self._clock = clock
-        self._capture = cv2.VideoCapture(library_name(path))
+        with _opening:
+            self._capture = cv2.VideoCapture(library_name(path))
         if self._capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == DEPTH_FORMAT:
             self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         fps = self._capture.get(cv2.CAP_PROP_FPS)

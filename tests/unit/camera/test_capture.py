@@ -1,4 +1,6 @@
 import os
+import threading
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -8,7 +10,13 @@ import pytest
 from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS
 from mavbridge.camera import capture
-from mavbridge.camera.capture import CaptureSource, device_mode, open_device, open_stream
+from mavbridge.camera.capture import (
+    CaptureSource,
+    VideoFileCamera,
+    device_mode,
+    open_device,
+    open_stream,
+)
 from mavbridge.camera.grabber import ExposureClock
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -106,6 +114,38 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     assert (image.arrived_ns, image.stamp_ns) == (START_NS, 0)
     with pytest.raises(CameraError, match="ended, or was silent"):
         source.next_image()
+
+
+def test_captures_opened_at_once_have_their_own_options(monkeypatch, tmp_path, clock):
+    """A stream is being opened while a description of one and a file wait for their turn."""
+    monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
+    (sdp := tmp_path / "camera.sdp").touch()
+    before, seen = dict(os.environ), {}
+    is_opening, go_on = threading.Event(), threading.Event()
+
+    def open_capture(name, *_):
+        is_opening.set()
+        assert go_on.wait(10)
+        seen[name] = os.environ.get(capture.FFMPEG_OPTIONS_VARIABLE)
+        raise CameraError("seen")
+
+    def opened(open_it, source):
+        with suppress(CameraError):
+            open_it(source, clock=clock)
+
+    monkeypatch.setattr(cv2, "VideoCapture", open_capture)
+    low = capture.LOW_LATENCY_OPTIONS
+    file, stream = tmp_path / "flight.mp4", "udp://0.0.0.0:5600"
+    expected = {stream: low, str(sdp): low + capture.SDP_OPTIONS, str(file): None}
+    opened_by = ((open_stream, stream), (open_stream, str(sdp)), (VideoFileCamera, file))
+    threads = [threading.Thread(target=opened, args=each) for each in opened_by]
+    for thread in threads:
+        thread.start()
+        assert is_opening.wait(10)
+    go_on.set()
+    for thread in threads:
+        thread.join(10)
+    assert (seen, dict(os.environ)) == (expected, before)
 
 
 @pytest.mark.system
