@@ -13,7 +13,16 @@ import pyarrow as pa
 
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
-from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
+from mavbridge.core.rotation import Quaternion
+from mavbridge.core.vehicle import (
+    ACTION_CLASSES,
+    Action,
+    ActionKind,
+    ActionTrace,
+    AttitudeThrust,
+    BodyRates,
+    Sticks,
+)
 from mavbridge.recording.tables import Row, table_rows
 from policy.data.tables import (
     EXPERT_COLUMN,
@@ -25,7 +34,6 @@ from policy.data.tables import (
 from policy.errors import DatasetError
 
 Vector: TypeAlias = tuple[float, float, float]
-Quaternion: TypeAlias = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,7 +150,9 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: boo
     values = {name: row[name] for name in _TICK}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
-    values["sent"] = row["sent"] and make(*row["sent"])
+    # Body rates would keep a lean: outside the policy's flight the guard sends attitudes.
+    sent_as = AttitudeThrust if make is BodyRates and row["raw"] is None else make
+    values["sent"] = row["sent"] and sent_as(*row["sent"])
     values["rc_sticks"] = row["rc_sticks"] and Sticks(*row["rc_sticks"])
     if row["position_ned_m"] is not None:
         values["position_ned_m"] = Position(*row["position_ned_m"])

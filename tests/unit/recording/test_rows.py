@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from helpers.factories import make_state, make_tick, make_trace
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
-from mavbridge.core.vehicle import Sticks
+from mavbridge.core.vehicle import AttitudeThrust, BodyRates, Sticks
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,
@@ -118,3 +118,17 @@ def test_the_columns_are_those_of_the_document() -> None:
     tables = (DEMONSTRATION_TICKS, DEMONSTRATION_FRAMES)
     names = {name for table in tables for name in table.names}
     assert [name for name in names if name not in text] == []
+
+
+def test_an_attitude_sent_for_body_rates_comes_back_as_one() -> None:
+    """It prepares or levels the vehicle; the history of a replay must not take it for rates."""
+    flown = BodyRates(0.5, 0.25, -0.5, 1.0)
+    sent = [AttitudeThrust(0.0, 0.0, 0.0, 0.0), flown, AttitudeThrust(0.5, 0.0, 0.0, 0.0), None]
+    traces = [None, make_trace(flown), None, None]
+    rows = [
+        tick_columns(TickRow(make_tick(number, sent=action, trace=trace), 0))
+        for number, (action, trace) in enumerate(zip(sent, traces, strict=True))
+    ]
+    table = pa.Table.from_pylist(rows, DEMONSTRATION_TICKS)
+    back = [row.tick.sent for row in read_ticks(table, "rates")]
+    assert (back, [*map(type, back)]) == (sent, [*map(type, sent)])
