@@ -257,7 +257,8 @@ class _Flight:
         visions = [
             Worker(name, vision.run) for name, vision in zip(names, self._visions, strict=True)
         ]
-        policy = Worker("mavbridge-policy", self._scheduled(self._policy.run))
+        policy_run = self._scheduled(self._policy.run, screen.show_message)
+        policy = Worker("mavbridge-policy", policy_run)
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
         listen = self._scheduled(partial(self._guard.listen, view=view))
         listener = Worker("mavbridge-guard", listen)
@@ -291,14 +292,16 @@ class _Flight:
         self._guard.send("engage" if key == ENGAGE_KEY else "release")
 
     def _scheduled(
-        self, run: Callable[[threading.Event], None]
+        self,
+        run: Callable[[threading.Event], None],
+        report: Callable[[str], object] = lambda _refusal: None,
     ) -> Callable[[threading.Event], None]:
         """Wrap a loop so that its thread sets its scheduling first."""
 
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread() if self._config.rates.realtime else None
             if refusal is not None:
-                self._observers.screen.show_message(refusal)
+                report(refusal)
             run(stop)
 
         return run_settled

@@ -37,6 +37,7 @@ def test_a_flight_holds_its_altitude_gives_the_sticks_back_and_is_reported_and_r
         status, output = flying.fly(*FLY, "--policy", "scripted:hover", "--duration", "6", *flags)
     assert status == 0, output
     assert "Arming motors" in output
+    assert output.count("no real-time scheduling") <= 2, "of the guard and of the policy"
     overrides, report, vehicle = flying.relay.overrides, flying.report(), flying.vehicle_report()
     assert 2.0 < vehicle["max_altitude_m"] < 4.5
     assert not vehicle["crashed"]
