@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
@@ -147,7 +148,7 @@ def write_durably(path: Path, text: str) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    temporary = path.with_suffix(f".{os.getpid()}")
+    temporary = path.with_suffix(f".{os.getpid()}-{threading.get_native_id()}")
     temporary.unlink(missing_ok=True)  # left by a loss of power, or a stranger's link
     try:
         with temporary.open("x", encoding="utf-8", errors="backslashreplace") as file:

@@ -3,6 +3,7 @@
 import errno
 import os
 import stat
+import threading
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,23 @@ def test_a_file_system_that_writes_no_folders_to_the_disk_will_do(
         write_durably(tmp_path / "meta.json", "{}")
     assert [path.name for path in tmp_path.iterdir()] == ["meta.json"]
     assert (tmp_path / "meta.json").read_text() == "{}"
+
+
+def test_two_threads_may_write_one_file_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, path = os.fsync, tmp_path / "meta.json"
+    others = [threading.Thread(target=write_durably, args=(path, "2"))]
+
+    def fsync(fd: int) -> None:
+        if others:
+            (other := others.pop()).start()
+            other.join(10)
+        real(fd)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_durably(path, "1")
+    assert {each.name: each.read_text() for each in tmp_path.iterdir()} == {"meta.json": "1"}
 
 
 def test_a_folder_that_was_removed_is_not_made_again(tmp_path: Path) -> None:

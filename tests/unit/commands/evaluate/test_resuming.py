@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def test_a_full_disk_ends_the_evaluation_and_keeps_its_results(
 
 
 def test_a_link_planted_for_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / f"out.{os.getpid()}").symlink_to(tmp_path / "victim")
+    (tmp_path / f"out.{os.getpid()}-{threading.get_native_id()}").symlink_to(tmp_path / "victim")
     write_output(tmp_path / "out.json", "caf\udce9", "--json")
     text = r"caf\udce9"
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"out.json": text}
