@@ -232,12 +232,11 @@ class Episodes:
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder, "--out")
         start_ns, offset_ns = self._clock.now_ns(), wall_offset_ns(self._clock)
-        recorder = Recorder()
         try:
             pipe = open_tlog_pipe()
             log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=offset_ns)
             pipe.writer.close()
-            recorder.begin(
+            recorder = Recorder(
                 folder,
                 flight_meta(self._plan, "pilot", start_ns, offset_ns),
                 tlog_pipe=pipe,

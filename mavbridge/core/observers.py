@@ -62,21 +62,24 @@ class BoundedQueue(Generic[_Item]):
 class ObserverThread:
     """A ``TickSink`` that passes events in batches to a consumer on its own thread.
 
-    Events are queued from the construction on, also before ``start``. Ticks and vision ticks queue
-    separately, so images, which are large and slow to handle, drop first and never push a tick out.
-    Ticks must be emitted by one thread, solves by one, and the vision ticks of each camera by one.
-    The observer's thread is a daemon: a consumer that hangs cannot keep the process alive.
+    Ticks and vision ticks queue separately, so images, which are large and slow to handle, drop
+    first and never push a tick out. Ticks must be emitted by one thread, solves by one, and the
+    vision ticks of each camera by one. The observer's thread is a daemon: a consumer that hangs
+    cannot keep the process alive.
     """
 
     def __init__(
         self,
         name: str,
+        consumer: Consumer,
         *,
         capacity: int,
         image_capacity: int = 16,
         cameras: int = 1,
     ) -> None:
-        """``capacity``: most queued ticks, and most queued solves. ``image_capacity``: most queued
+        """Start the thread. The consumer belongs to it from here on.
+
+        ``capacity``: most queued ticks, and most queued solves. ``image_capacity``: most queued
         vision ticks per camera.
         """
         self._name = name
@@ -91,12 +94,7 @@ class ObserverThread:
         self.failure: str | None = None
         """Why the observer stopped before it was closed, or None."""
         self._in_flight = 0
-
-    def start(self, consumer: Consumer) -> None:
-        """Start the thread. The consumer belongs to it from here on."""
-        self._thread = threading.Thread(
-            target=self._run, args=(consumer,), name=self._name, daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, args=(consumer,), name=name, daemon=True)
         self._thread.start()
 
     def emit(self, event: Observed) -> None:

@@ -7,7 +7,7 @@ Arrays are read-only once they are published here.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ ImageArray: TypeAlias = NDArray[np.uint8]
 """[H, W, 3] in RGB."""
 CameraImage: TypeAlias = NDArray[np.uint8 | np.uint16]
 """[H, W, 3] uint8 in RGB; or [H, W] uint16, the depth of each pixel in units of the camera."""
+RateMode = Literal["dual", "single"]
+"""Whether images are encoded at a rate of their own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +85,7 @@ class Position(NamedTuple):
 class Tick(GuardTick):
     """One step of the guard, with everything that explains it afterwards.
 
-    Missed slots count if the policy had control at this tick and at the last one.
+    ``missed_slots`` is 0 unless the policy had control at this tick and the one before.
     """
 
     predict_ns: int | None
@@ -110,8 +112,8 @@ class Tick(GuardTick):
 
     @property
     def lacks_neutral(self) -> bool:
-        """True on the way out if nothing was sent: a refusal by the link if neutral was due, see
-        ``FlightMeta.keeps_neutral``."""
+        """True if nothing was sent while LEAVING or HOLDING; with ``FlightMeta.keeps_neutral``
+        the link refused it."""
         return self.sent is None and self.phase in ("leaving", "holding")
 
     @property

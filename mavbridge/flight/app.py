@@ -217,7 +217,8 @@ class _Flight:
         )
         self._observers.open_viewer(stack)
         self._observers.open_recorder(guard, lambda: self._view.status.autopilot)
-        recorders, sink = self._observers.recorders, FanOut((*self._observers.sinks, *sinks))
+        detailed = self._observers.detailed_observers
+        sink = FanOut((*self._observers.sinks, *sinks))
         self._view = TelemetryCache(
             plan, sink=sink, samples=guard.samples, watch_packets=self._observers.watch_packets
         )
@@ -229,7 +230,7 @@ class _Flight:
             cameras=cameras,
             caches=caches,
             clocks=[clock] * len(cameras),
-            sinks=[sink, *[FanOut(recorders)] * (len(cameras) - 1)],
+            sinks=[sink, *[FanOut(detailed)] * (len(cameras) - 1)],
             watches_images=looks_at_images(plan.config),
         )
         self._policy = PolicyLoop(
@@ -239,7 +240,7 @@ class _Flight:
             view=self._view,
             caches=caches,
             send=guard.send,
-            watches=[each.emit for each in recorders],
+            watches=[each.emit for each in detailed],
         )
         self._watchdog = _Watchdog(plan, clock, self._policy, self._visions)
 

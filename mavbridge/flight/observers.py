@@ -10,8 +10,8 @@ from rich.console import Console
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.course import CourseGate, read_gates
-from mavbridge.core.errors import UserError
-from mavbridge.core.files import as_json
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.files import as_json, write_output
 from mavbridge.core.observers import ObserverThread
 from mavbridge.core.provenance import (
     command_line,
@@ -20,7 +20,7 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.records import FlightOutcome, TickSink
+from mavbridge.core.records import FlightOutcome, RateMode, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.history import ActionFrame
@@ -29,8 +29,8 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files
 from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
-from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops
-from mavbridge.recording.folder import FlightMeta, FlightSource, remove_flight, write_meta
+from mavbridge.observe.timing import FlightTiming, ObserverDrops
+from mavbridge.recording.folder import FlightMeta, FlightSource, remove_flight
 from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
@@ -90,9 +90,11 @@ def open_viewer(
         gates=gates,
     )
     viewer = ObserverThread(
-        "mavbridge-rerun", capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
+        "mavbridge-rerun",
+        RerunView(target, flight, is_live=True),
+        capacity=RERUN_CAPACITY,
+        cameras=len(contract.cameras),
     )
-    viewer.start(RerunView(target, flight, is_live=True))
     stack.callback(viewer.close, VIEWER_JOIN_S)
     return viewer
 
@@ -107,7 +109,7 @@ class FlightObservers:
         self._plan = plan
         self._runner = runner
         self._clock = clock
-        self._mode: Mode = "dual" if plan.is_dual else "single"
+        self._mode: RateMode = "dual" if plan.is_dual else "single"
         action_hz, vision_hz = plan.loops.action_hz, plan.image_rates_hz[0]
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
@@ -122,11 +124,11 @@ class FlightObservers:
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
-        """Open observers, for the bridge."""
-        return (self._timing, self.screen, self.referee, *self.recorders)
+        """Open observers."""
+        return (self._timing, self.screen, self.referee, *self.detailed_observers)
 
     @property
-    def recorders(self) -> tuple[ObserverThread, ...]:
+    def detailed_observers(self) -> tuple[ObserverThread, ...]:
         """Observers that take every solve, and the images of all cameras."""
         return tuple(sink for sink in (self._recorder, self._viewer) if sink is not None)
 
@@ -143,7 +145,7 @@ class FlightObservers:
         """Start the recorder if --record is given.
 
         Raises:
-            UserError: the folder cannot be written.
+            WriterError: the folder cannot be written.
         """
         if self._config.record is None or guard.tlog_pipe is None:
             return
@@ -158,36 +160,34 @@ class FlightObservers:
             plan=self._plan.figures(),
             policy_files=digests(policy_files(self._config.policy)),
         )
-        recorder = Recorder(cameras=len(meta.contract.cameras))
-        try:
-            recorder.begin(
-                self._config.record,
-                meta,
-                tlog_pipe=guard.tlog_pipe,
-                packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
-                autopilot=autopilot,
-                report=self.screen.show_message,
-                settings=ReplaySettings(config=self._config, wall_offset_ns=guard.wall_offset_ns),
-            )
-        except OSError as error:
-            raise UserError(f"--record {self._config.record}: {error}") from error
-        self._recorder = recorder
+        self._recorder = Recorder(
+            self._config.record,
+            meta,
+            tlog_pipe=guard.tlog_pipe,
+            packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
+            autopilot=autopilot,
+            report=self.screen.show_message,
+            settings=ReplaySettings(config=self._config, wall_offset_ns=guard.wall_offset_ns),
+        )
 
     def close_recorder(
         self, guard: GuardProcess, outcome_of: Callable[[], FlightOutcome | None]
     ) -> None:
         """Finish the recording. Call after the guard has ended, so that it has the release."""
         recorder = self._recorder
-        if recorder is None or self._config.record is None:
+        if recorder is None:
             return
         outcome = outcome_of()
-        meta = recorder.meta if outcome is None else recorder.meta.with_outcome(outcome)
         params = {} if guard.summary is None else guard.summary.params
-        recorder.meta = replace(meta, parameters=params)
+
+        def with_end(meta: FlightMeta) -> FlightMeta:
+            meta = meta if outcome is None else meta.with_outcome(outcome)
+            return replace(meta, parameters=params)
+
         try:
-            write_meta(self._config.record, recorder.meta)  # in case that it takes too long
-        except OSError as error:
-            self.screen.show_message(f"--record {self._config.record}: {error.strerror}")
+            recorder.describe(with_end)  # in case that the rest takes too long
+        except MavbridgeError as error:
+            self.screen.show_message(f"--record: {error}")
         recorder.close(RECORDER_JOIN_S)
 
     def finish(
@@ -225,6 +225,6 @@ class FlightObservers:
             self.screen.show_message(describe(outcome))
         if self._config.report is not None:
             try:
-                self._config.report.write_text(as_json(report))
-            except OSError as error:  # a full disk, no more open files
-                self.screen.show_message(f"--report {self._config.report}: {error.strerror}")
+                write_output(self._config.report, as_json(report), "--report")
+            except UserError as error:  # a full disk, no more open files
+                self.screen.show_message(str(error))

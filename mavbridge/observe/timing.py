@@ -1,20 +1,18 @@
 """Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Event, FlightOutcome, Tick
+from mavbridge.core.records import Event, FlightOutcome, RateMode, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
 MAX_RELEASES = 1000
 """Releases listed in a report; further ones are only counted."""
 LATE_PERIODS = 1.5
 """A chunk is late if it comes more than this many policy periods after the one before."""
-
-Mode = Literal["dual", "single"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +84,7 @@ class TimingReport:
     """Timing of one flight; None: not measured."""
 
     duration_s: float
-    mode: Mode
+    mode: RateMode
     engine: str
     policy: str
     autopilot: str | None
@@ -190,7 +188,7 @@ class FlightTiming:
     def report(
         self,
         *,
-        mode: Mode,
+        mode: RateMode,
         engine: str,
         policy: str,
         autopilot: str | None = None,

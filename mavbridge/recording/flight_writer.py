@@ -1,6 +1,7 @@
 """Single-threaded writer of a flight's folder: tables, videos and meta."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -88,7 +89,7 @@ class FlightWriter:
         replay. The reader of ``tlog_pipe`` becomes ``link.tlog`` and is closed here.
         """
         self._folder = folder
-        self.meta = meta
+        self.meta, self._meta_lock = meta, threading.Lock()
         self._flushed_ns = meta.start_ns
         self._serials, self._solve_serials = SerialNumbers(), SerialNumbers(first=1)
         self._tables: list[TableWriter] = []
@@ -205,11 +206,11 @@ class FlightWriter:
             for table in self._tables:
                 table.flush()
 
-    def describe(self, meta: FlightMeta) -> None:
-        """Replace ``meta.json``."""
-        self.meta = meta
-        with self._writing():
-            write_meta(self._folder, meta)
+    def describe(self, change: Callable[[FlightMeta], FlightMeta]) -> None:
+        """Change ``meta.json``. Thread-safe."""
+        with self._meta_lock, self._writing():
+            self.meta = change(self.meta)
+            write_meta(self._folder, self.meta)
 
     @property
     def misfit(self) -> str | None:
@@ -245,7 +246,7 @@ class FlightWriter:
         is_whole = self.video_failure is None
         written = [each.video.written for each in self._cameras]
         self.describe(
-            replace(
+            lambda _: replace(
                 meta,
                 finished=is_whole,
                 ticks=self._ticks.rows,

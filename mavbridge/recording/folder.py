@@ -11,7 +11,7 @@ from typing import Literal
 
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import as_json, from_json, write_durably
-from mavbridge.core.records import FlightOutcome
+from mavbridge.core.records import FlightOutcome, RateMode
 from policy.contract import Contract
 from policy.data import flight_files as files
 from policy.data.flight_files import META, of_camera, read_meta_document, video_of
@@ -73,7 +73,7 @@ class FlightMeta:
     source: FlightSource
     policy: str | None
     engine: str | None
-    mode: Literal["dual", "single"]
+    mode: RateMode
     autopilot: str | None = None
     action_hz: float
     visual_hz: float

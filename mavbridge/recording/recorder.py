@@ -23,21 +23,13 @@ IMAGE_CAPACITY = 32
 
 
 class Recorder(ObserverThread):
-    """Recording of one flight while it flies, from the construction of the recorder on.
+    """Recording of one flight while it flies.
 
     Call ``close`` once the link is closed; if the link's process is still running, the writer
     process keeps its log to the end.
     """
 
-    def __init__(self, *, cameras: int = 1) -> None:
-        super().__init__(
-            "mavbridge-recorder",
-            capacity=CAPACITY,
-            image_capacity=IMAGE_CAPACITY,
-            cameras=cameras,
-        )
-
-    def begin(
+    def __init__(
         self,
         folder: Path,
         meta: FlightMeta,
@@ -61,7 +53,13 @@ class Recorder(ObserverThread):
             folder, meta, pressure="online", settings=settings, tlog_pipe=tlog_pipe
         )
         self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
-        self.start(self._flight)
+        super().__init__(
+            "mavbridge-recorder",
+            self._flight,
+            capacity=CAPACITY,
+            image_capacity=IMAGE_CAPACITY,
+            cameras=len(meta.contract.cameras),
+        )
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Queue the stamps of received packets, or drop and count them. For one thread only."""
@@ -87,12 +85,12 @@ class Recorder(ObserverThread):
 
     @property
     def meta(self) -> FlightMeta:
-        """Contents of ``meta.json``; complete after ``close``. Set before it, they are added to."""
+        """Contents of ``meta.json``; complete after ``close``."""
         return self._flight.writer.meta
 
-    @meta.setter
-    def meta(self, meta: FlightMeta) -> None:
-        self._flight.writer.meta = meta
+    def describe(self, change: Callable[[FlightMeta], FlightMeta]) -> None:
+        """Change ``meta.json`` before ``close``; raise WriterError if it cannot be written."""
+        self._flight.writer.describe(change)
 
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
@@ -145,7 +143,7 @@ class _FlightConsumer:
         """Complete ``meta.json`` once the vehicle is known, for a flight that is cut off."""
         meta = self.writer.meta
         if isinstance(event, Tick) and event.mode and (name := self.autopilot()) != meta.autopilot:
-            self.writer.describe(replace(meta, autopilot=name))
+            self.writer.describe(lambda meta: replace(meta, autopilot=name))
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1

@@ -37,9 +37,7 @@ class Recorder:
 
 
 def observing(consumer: Recorder, **sizes: int) -> ObserverThread:
-    observer = ObserverThread("viewer", **sizes)
-    observer.start(consumer)
-    return observer
+    return ObserverThread("viewer", consumer, **sizes)
 
 
 def test_every_event_reaches_the_consumer_in_order_on_the_named_thread() -> None:

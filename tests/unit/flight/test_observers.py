@@ -12,6 +12,7 @@ from rich.console import Console
 from helpers.factories import make_tick
 from helpers.fakes import FakeClock
 from helpers.guard_facts import DEATH
+from helpers.recordings import disk_of
 from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.plan import plan_flight
@@ -42,6 +43,11 @@ def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     observers(tmp_path, said).finish(None, "ardupilot", None)
     assert f"--report {tmp_path}: Is a directory" in said.getvalue()
     assert " of 10 Hz" in said.getvalue(), "the rate of the contract's camera"
+    (report := tmp_path / "report.json").write_text("of the flight before")
+    with disk_of(100):
+        observers(report, said).finish(None, "ardupilot", None)
+    assert f"--report {report}: File too large" in said.getvalue()
+    assert report.read_text() == "of the flight before"
 
 
 def test_a_flight_that_flew_is_reported_although_the_vehicle_is_gone(tmp_path: Path) -> None:
@@ -72,8 +78,8 @@ def test_the_stamps_of_a_recording_have_the_wall_time_of_its_log(
 ) -> None:
     """The guard starts before the weights load; wall time may step until the recorder does."""
     begun: dict[str, Any] = {}
-    stub = SimpleNamespace(begin=lambda _folder, meta, **rest: begun.update(rest, meta=meta))
-    monkeypatch.setattr(recorder, "Recorder", lambda **_: stub)
+    begin = lambda _folder, meta, **rest: begun.update(rest, meta=meta)  # noqa: E731
+    monkeypatch.setattr(recorder, "Recorder", begin)
     guard: Any = SimpleNamespace(tlog_pipe=object(), wall_offset_ns=1_700_000_000 * 10**9)
     watching = observers(tmp_path / "report.json", io.StringIO(), record=tmp_path / "flight")
     watching.open_recorder(guard, lambda: "ArduPilot")

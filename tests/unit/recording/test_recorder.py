@@ -2,7 +2,10 @@ import multiprocessing
 import os
 import resource
 import signal
+import threading
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, send_signal
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import read_meta, remove_flight
+from mavbridge.recording.folder import FlightMeta, read_meta, remove_flight
 from mavbridge.recording.recorder import Recorder
 from mavbridge.recording.tlog import open_tlog_pipe
 
@@ -27,8 +30,7 @@ class RecorderStand:
         self.told: list[str] = []
         self.packets = PacketPipe(os.dup(tlog_pipe.writer.fileno()), wall_offset_ns=10**18)
         tlog_pipe.writer.close()
-        self.recorder = Recorder()
-        self.recorder.begin(
+        self.recorder = Recorder(
             folder,
             make_meta(),
             tlog_pipe=tlog_pipe,
@@ -60,7 +62,7 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
         assert read_meta(tmp_path).autopilot == "ardupilot 4.6.0", "known if it is cut off now"
         send_signal(stood.pid, signal.SIGKILL)
         stood.emit(range(10, 40), range(10, 20))
-        stood.recorder.meta = replace(stood.recorder.meta, parameters={"RC_SPEED": 490.0})
+        stood.recorder.describe(lambda meta: replace(meta, parameters={"RC_SPEED": 490.0}))
     assert len(stood.told) == 1
     assert "recording no more images: the writer process has died" in stood.told[0]
     back = open_flight(tmp_path)
@@ -70,6 +72,22 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
     assert len(list(back.images())) == back.frames.num_rows
     assert 10 <= stood.recorder.dropped <= 20
     assert "not completely: the writer process has died" in stood.recorder.summary()
+
+
+def test_two_threads_may_describe_a_flight_at_once(tmp_path: Path) -> None:
+    def add(names: Sequence[str]) -> None:
+        for name in names:
+            stood.recorder.describe(partial(with_condition, name))
+
+    def with_condition(name: str, meta: FlightMeta) -> FlightMeta:
+        return replace(meta, conditions=meta.conditions | {name: 0.0})
+
+    with RecorderStand(tmp_path) as stood:
+        other = threading.Thread(target=add, args=([*map(str, range(50))],))
+        other.start()
+        add([*map(str, range(50, 100))])
+        other.join(DEADLINE_S)
+        assert len(read_meta(tmp_path).conditions) == 100
 
 
 @pytest.mark.parametrize(

@@ -79,14 +79,14 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
 def test_an_episode_begins_when_its_writer_runs(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begin = Recorder.begin
+    begin = Recorder.__init__
 
     def begin_late(*args: object, **kwargs: object) -> None:
         stand.episodes.emit(make_tick(3))
         stand.episodes.emit(make_frame(3))
         begin(*args, **kwargs)
 
-    monkeypatch.setattr(Recorder, "begin", begin_late)
+    monkeypatch.setattr(Recorder, "__init__", begin_late)
     stand.record(4)
     assert [row.tick.index for row in stand.flight(1).tick_rows()] == [4, 5, 6]
     assert [row.frame_id for row in stand.flight(1).frame_rows()] == [
