@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.processes import child_environment
+from mavbridge.core.processes import child_environment, end
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
@@ -61,7 +61,7 @@ def check_target(text: str) -> None:
         raise UserError(problem)
     if not listens(parts.hostname, port, timeout_s=CONNECT_TIMEOUT_S):
         raise PeerError(
-            f"no Rerun viewer listens at {url}: start one with `rerun`, let the bridge start one "
+            f"no Rerun viewer listens at {url}: start one with `rerun`, let mavbridge start one "
             "(--rerun spawn), or record to a file (--rerun flight.rrd)"
         )
 
@@ -104,8 +104,7 @@ def spawn_viewer(command: list[str], *, port: int) -> "subprocess.Popen[bytes]":
             problem = f"exited at once: {lines[-1] if lines else 'it gave no reason'}"
             break
         else:
-            process.terminate()
-            process.wait(SPAWN_TIMEOUT_S)
+            end(process)
             problem = f"did not listen within {SPAWN_TIMEOUT_S:g} s"
     raise MavbridgeError(
         f"the Rerun viewer {problem}; record to a file instead: --rerun flight.rrd"

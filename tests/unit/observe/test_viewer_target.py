@@ -1,11 +1,14 @@
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
+from mavbridge.core import processes
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
 from mavbridge.observe import viewer_target
@@ -84,6 +87,25 @@ def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None
     socket.create_connection(("127.0.0.1", port), 10).close()
     spawned.kill()
     spawned.wait(10)
+
+
+def test_a_spawned_viewer_that_never_listens_is_ended(
+    bound_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer_target, "SPAWN_TIMEOUT_S", 2.0)
+    monkeypatch.setattr(processes, "END_TIMEOUT_S", 0.1)
+    spawned: list[subprocess.Popen[bytes]] = []
+
+    def spawn(*args: Any, **kwargs: Any) -> subprocess.Popen[bytes]:
+        spawned.append(popen(*args, **kwargs))
+        return spawned[0]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", spawn)
+    stubborn = "import signal; signal.signal(15, signal.SIG_IGN); signal.pause()"
+    with pytest.raises(MavbridgeError, match="did not listen within 2 s; record to a file"):
+        spawn_viewer([sys.executable, "-c", stubborn], port=bound_port)
+    assert spawned[0].poll() is not None
 
 
 def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: int) -> None:
