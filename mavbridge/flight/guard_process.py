@@ -250,10 +250,13 @@ class GuardProcess:
         return True
 
     def close(self) -> None:
-        """Close the channel. A running guard takes this for our death, and ends by itself."""
+        """Close the channel. A running guard takes this for our death, and ends by itself, once it
+        holds no sticks."""
         self._port.close()
         self.samples.close()
-        self.wait(0.0 if self.is_stuck else CLOSE_S)
+        newest = self._newest if self.summary is None else None
+        is_holding = newest is not None and newest.phase is Phase.HOLDING
+        self.wait(0.0 if self.is_stuck or is_holding else CLOSE_S)
         self._close_outlet()
 
 

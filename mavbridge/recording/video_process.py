@@ -146,7 +146,9 @@ class Notice(Enum):
     READY = auto()
     """Sent by the writer: it runs."""
     DONE = auto()
-    """Sent by the writer: everything is closed."""
+    """Sent by the writer: everything is closed, but for a log that goes on."""
+    KEEPS_LOG = auto()
+    """Sent by the writer before ``DONE``: the log has not ended."""
 
 
 ToWriter: TypeAlias = Ring | Submit | Notice
@@ -185,21 +187,23 @@ class WriterService:
             return
 
     def serve(self, timeout_s: float) -> None:
-        """Copy the log, then wait for one message and handle it."""
-        what = "log of the link"
+        """Wait for one message, copy the log, then handle the message."""
+        what = "video"
         try:
+            message = self._receive() if self._pipe.poll(timeout_s) else None
+            what = "log of the link"
             if self._tlog is not None:
                 self._tlog.copy()
             what = "video"
-            if not self._pipe.poll(timeout_s):
-                return
-            match self._receive():
+            match message:
                 case Submit(slot=slot, captured_ns=captured_ns) if self._slots is not None:
                     self._video.append(self._slots[slot], captured_ns)
                     self.send(Written(slot))
                 case Notice.FINISH:
                     self._video.close()
                     self.is_open = False
+                    if self._tlog is not None and not self._tlog.has_ended:
+                        self.send(Notice.KEEPS_LOG)
                     self.send(Notice.DONE)
         except WRITE_ERRORS as error:
             self._fail(what, error)

@@ -72,7 +72,6 @@ class VideoWriter:
         """Why a frame was dropped that the video cannot have; None if there was none."""
         self.written = 0
         """Number of frames known to be in the file."""
-        self._keeps_log = job.tlog is not None
         self._pipe, self._process = start_process(job, NICENESS if pressure == "online" else 0)
         # A policy's forks must not hide the producer's death from the writer.
         os.register_at_fork(after_in_child=self._pipe.close)
@@ -200,9 +199,10 @@ class VideoWriter:
         """End the process; frames submitted but not written can be lost. Can be called twice."""
         self._slots = None
         self._pipe.close()
+        if Notice.KEEPS_LOG in self._notices:
+            return
         self._process.join(END_S)
-        is_keeping_log = self._keeps_log and Notice.DONE in self._notices
-        if self._process.is_alive() and not is_keeping_log:
+        if self._process.is_alive():
             self._process.kill()
             self._process.join(END_S)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,6 +25,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight import guard_process
 from mavbridge.flight.guard_process import (
+    CLOSE_S,
     LATEST_NS,
     SILENT_WAITS,
     GuardProcess,
@@ -245,6 +247,21 @@ def test_a_guard_that_stands_still_is_killed_if_its_last_words_can_be_sent(
             rig.guard.listen(stop, View())
         assert b"".join(link.heard()) == b"".join(WHOLE)
     link.close()
+
+
+@pytest.mark.parametrize(
+    ("phase", "waited_s"), [(Phase.RELEASED, CLOSE_S), (Phase.LEAVING, CLOSE_S), (Phase.HOLDING, 0)]
+)
+def test_a_guard_that_holds_sticks_is_not_waited_for(
+    rig: Rig, phase: Phase, waited_s: float
+) -> None:
+    rig.tick(phase)
+    stop, told_s = threading.Event(), list[float]()
+    view = SimpleNamespace(receive=lambda _: stop.set())
+    rig.guard.listen(stop, view)
+    rig.child.wait = lambda timeout_s: told_s.append(timeout_s) or 0
+    rig.guard.close()
+    assert told_s == [waited_s]
 
 
 @pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])
