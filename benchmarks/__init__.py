@@ -1,7 +1,6 @@
 """Comparisons and studies for developers; run one with ``python -m benchmarks.NAME``.
 
-compare             our engines, a flight, and our link beside others
-link                latency of our link client and of others, in turn
-two_rates           one rate and two rates, over the time to encode an image
-train_shipped       training of the shipped policies
+compare, link, two_rates, engines   our rates, latencies and engines, beside others
+train_shipped, teach_looks          training of the shipped policies
+animation, page_pictures, ...       pictures and generated pages of the documentation
 """

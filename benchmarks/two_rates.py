@@ -94,9 +94,9 @@ class Cell:
     speed_mps: float
 
     @property
-    def key(self) -> tuple[str, str, int, str]:
+    def key(self) -> tuple[str, str, int, int, str]:
         """Identity of the cell."""
-        return self.control, self.loop, self.encoder_ms, self.checkpoint_sha256
+        return self.control, self.loop, self.encoder_ms, self.episodes, self.checkpoint_sha256
 
 
 @app.default
@@ -121,11 +121,11 @@ def main(
     """
     require_outputs(json, plot)
     known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
-    cells = {cell.key: cell for cell in known if cell.episodes == episodes}
+    cells = {cell.key: cell for cell in known}
     shown = []
     for control, encoder_ms, loop in product(CONTROLS, ENCODER_MS, LOOPS):
         weights = rates if control.is_race else sticks
-        key = (control.name, loop, encoder_ms, sha256(weights))
+        key = (control.name, loop, encoder_ms, episodes, sha256(weights))
         if key not in cells:
             cells[key] = evaluate(control, loop, encoder_ms, weights, episodes, workers)
             json.write_text(dumps([asdict(one) for one in cells.values()], indent=2) + "\n")

@@ -1,7 +1,7 @@
 """A policy's inputs and outputs: names, order, frames, shapes, times.
 
-This is the only module of ``policy`` that the loops depend on; it imports only numpy. A checkpoint
-carries its ``Contract`` in the header, and the bridge rejects a contract that it cannot keep.
+Imports no torch. A checkpoint carries its ``Contract`` in the header, and mavbridge rejects a
+contract that it cannot keep.
 """
 
 import json

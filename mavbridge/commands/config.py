@@ -171,8 +171,8 @@ class ImagineConfig(Ranged):
             )
         if self.frames is not None and self.exe_steps > self.frames:
             raise UserError(
-                f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "
-                "that are imagined can be gone through; lower the one or raise the other"
+                f"--exe-steps {self.exe_steps} exceeds --frames {self.frames}: only imagined "
+                "frames can be executed"
             )
 
 
@@ -205,8 +205,7 @@ class RecordConfig(Ranged):
     vehicle: ListenConfig = field(default_factory=ListenConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     camera_size: Annotated[int, Parameter(group=CAMERA), Between(32, 4096, "pixels")] = 224
-    """Pixels a side that the image must cover; a device is asked for such a mode. It is recorded in
-    the size in which it comes."""
+    """Least side of the image in pixels. A device is asked for it; any size is recorded."""
     visual_rate: Annotated[float, Parameter(group=CAMERA), Between(0.5, 240, "Hz")] = 30.0
     """Most frames a second."""
     rate: Annotated[float, Parameter(group=RATES), Between(20, 250, "Hz")] = 100.0
@@ -266,8 +265,8 @@ class ReplayConfig(Ranged):
     max_chunk_age: Annotated[float | None, hidden("limits.chunk-age")] = None
     """Another time for which one chunk may be flown, in seconds."""
     tolerance: Annotated[float | None, Between(0, 10)] = None
-    """Largest difference of a stick that still counts as equal; by default 0 for the same engine,
-    and more for another one and for the video. Where something else was asked for there is none."""
+    """Largest difference of a stick that counts as equal; default: 0, another engine 0.05, video
+    0.15, scripted 0.01; none if policy or limits were changed."""
     plot: Path | None = None
     """Draw the sticks, recorded and replayed, into this PNG."""
     json: Path | None = None

@@ -80,7 +80,8 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
             should_stop=should_stop,
         )
         log = flight.vehicle.log
-        success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
+        is_round = flight.course.is_loop and result.gates_passed > 0
+        success = not log.crashed and (log.next_gate is None or is_round)
         writer.finish(replace(writer.meta, success=success, gates_passed=result.gates_passed))
         if writer.video_failure is not None:
             raise writer.video_failure
@@ -111,8 +112,9 @@ def _terms(
         name = wanted.checkpoint or wanted.policy
         raise UserError(f"{name} flies by {action}, and the expert by {config.action} (--action)")
     max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
-    contract = replace(student.contract, max_feature_age_s=max_age_s, stops_at_end=True)
-    return contract, replace(student, contract=contract)
+    theirs = replace(student.contract, max_feature_age_s=max_age_s, stops_at_end=True)
+    # The expert acts at every tick, however long the student's plans are played.
+    return replace(theirs, play_s=0.0), replace(student, contract=theirs)
 
 
 def _meta(

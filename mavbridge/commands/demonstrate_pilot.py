@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mavbridge.config.policy import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Action, BodyRates, Sticks
 from mavbridge.simulation.delays import Delay, Delays
@@ -158,7 +159,8 @@ class Pilot:
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is not None:
             # Also in the expert's turns: the student can have internal state.
-            if self._planned is None or now_ns - self._planned[0] >= solve_ns:
+            played_ns = self._student.contract.play_s / SOLVES_PER_PLAY * NS_PER_S
+            if self._planned is None or now_ns - self._planned[0] >= max(solve_ns, played_ns):
                 self._planned = now_ns, self._student.act(encoded, state, history).copy()
             planned_ns, plan = self._planned
             passed = (now_ns - planned_ns) / NS_PER_S / self._student.contract.chunk_dt_s

@@ -7,7 +7,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 
 from rich.console import Console
 
@@ -33,10 +33,13 @@ from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeResult
 from mavbridge.simulation.world import DRAWN_CONDITIONS, make_vehicle
+from policy.contract import LEAST
 from policy.files import read_json
 
 Z95 = 1.959963984540054
 """95 % of a normal distribution are within this many standard deviations."""
+T95 = (12.706, 4.303)
+"""The same of Student's t with one and two degrees of freedom."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +102,8 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         if config.solve_time is not None:
             longest_s = contract.horizon * contract.chunk_dt_s
             play_s = min(SOLVES_PER_PLAY * config.solve_time / 1000, longest_s)
-            contract = replace(contract, play_s=max(contract.play_s, play_s))
+            if play_s >= LEAST:  # else as good as at once
+                contract = replace(contract, play_s=max(contract.play_s, play_s))
         if config.state_time is not None:
             contract = replace(contract, state_time=config.state_time)
         runner = replace(loaded.runner, contract=contract)
@@ -119,19 +123,18 @@ def identity(config: EvaluateConfig) -> str:
     The number of flights, their machines and the output are left out. The weights of a policy
     server, and other files that a user's code reads, are unknown here.
     """
-    flags = replace(
-        config,
-        policy=replace(config.policy, checkpoint=None, contract=None),
-        episodes=1,
-        workers=WorkersConfig(),
-        resume=False,
-        json=None,
-    )
+    policy = replace(config.policy, checkpoint=None, contract=None)
+    flags = replace(_flags(config), policy=policy, episodes=1)
     files = policy_files(config.policy)
     known = digests(files)
     contents = [known.get(str(path.resolve()), str(path)) for path in files]
     parts = (flags, contents, git_revision(), sorted(versions().items()))
     return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _flags(config: EvaluateConfig) -> EvaluateConfig:
+    """Return the flags that may change a result, the others as by default."""
+    return replace(config, workers=WorkersConfig(), resume=False, json=None)
 
 
 def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisode]:
@@ -238,14 +241,23 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
-    """Return the mean with the interval of its standard error; None without values."""
+    """Return the mean with its interval by Student's t; None without values."""
     if not values:
         return None
     value, low, high = statistics.fmean(values), None, None
     if len(values) > 1:
-        half = Z95 * statistics.stdev(values) / math.sqrt(len(values))
+        half = _t95(len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
         low, high = value - half, value + half
     return Estimate(value=value, low=low, high=high, count=len(values))
+
+
+def _t95(freedom: int) -> float:
+    """Return Student's t at 97.5 %, within 1 % (Abramowitz and Stegun 1964, 26.7.5)."""
+    if freedom <= len(T95):
+        return T95[freedom - 1]
+    z, n = Z95, freedom
+    second, third = 5 * z**5 + 16 * z**3 + 3 * z, 3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z
+    return z + (z**3 + z) / (4 * n) + second / (96 * n**2) + third / (384 * n**3)
 
 
 FIGURES = {
@@ -285,13 +297,8 @@ def as_document(
     if episodes:
         summary = {**summarise(episodes), "outcomes": _outcomes(episodes)}
     return {
-        "policy": config.policy.policy,
+        "flags": _flags(config),
         "engine": _engine(flown),
-        "conditions": config.conditions,
-        "gusts_mps": config.gusts,
-        "vision_delay_ms": config.vision_delay,
-        "seed": config.policy.seed,
-        "asked_episodes": config.episodes,
         "flown_by": flown_by,
         "summary": summary,
         "episodes": episodes,
@@ -309,12 +316,10 @@ def print_evaluation(
         label = f"{shown}, of {episodes[0].gates_total}" if name == "gates_passed" else shown
         rows.append((label, *_cells(summary[name], "{:.2f}")))
     title = [f"{config.policy.policy} ({_engine(flown)})"]
-    if config.conditions != "nominal":
-        title.append(f"{config.conditions} conditions")
-    if config.gusts is not None:
-        title.append(f"gusts of {config.gusts:g} m/s")
-    if config.vision_delay:
-        title.append(f"images {config.vision_delay:g} ms later")
+    title += [f"{n} {getattr(config.policy, n)}" for n in config.policy.given("policy")]
+    flags, usual = _flags(config), EvaluateConfig(policy=config.policy, episodes=config.episodes)
+    changed = {n: value for n, value in vars(flags).items() if value != getattr(usual, n)}
+    title += [f"{n} {value}" for n, value in changed.items() if not is_dataclass(value)]
     header = ("", "mean", "95 % interval", "flights")
     console.print(make_table(", ".join(title), header, rows))
     ends = ", ".join(f"{count} {outcome}" for outcome, count in _outcomes(episodes).items())

@@ -62,7 +62,7 @@ VIDEO_TOLERANCE = 0.15
 """Tolerance of a smoothed stick for the lossy video, in full deflections: twice that measured."""
 ENGINE_TOLERANCE = 0.05
 """Tolerance of a smoothed stick on another engine, in full deflections. A single chunk can differ
-by ``parity.MAX_ACTION_ERROR``."""
+by ``choose.MAX_ACTION_ERROR``."""
 CLOCK_TOLERANCE = 0.01
 """Tolerance for a scripted policy, in full deflections: it reads the clock while it computes, with
 differences of some 0.1 ms."""
@@ -180,7 +180,9 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
 
     limits, policy = given(flown.limits), given(flown.policy)
     if asked.policy is not None:  # weights and files of the flight belong to another policy
-        policy = {"checkpoint": None, "contract": None} | policy
+        usual = PolicyConfig()
+        own = ("checkpoint", "contract", "by_rates", "image_size", "allow_untrained")
+        policy = {name: getattr(usual, name) for name in own} | policy
     return replace(
         flown,
         limits=replace(flown.limits, **limits),
@@ -299,7 +301,7 @@ class ReplayResult:
             if other and self.tolerance == 0:
                 found.append(f"{other} of {policy.solves} chunks differ")
         if (most := self.sticks.deviation.most) > self.tolerance:
-            found.append(f"a stick is off by {most:.4g}, more than {self.tolerance:g}")
+            found.append(f"an action is off by {most:.4g}, more than {self.tolerance:g}")
         return tuple(found)
 
     @property
@@ -346,7 +348,7 @@ def _verdict(result: ReplayResult) -> str:
         return "the difference is what was asked for"
     if result.tolerance == 0:
         return "EQUAL, bit for bit"
-    return f"EQUAL within {result.tolerance:g} of full stick"
+    return f"EQUAL within {result.tolerance:g}"
 
 
 def _row(name: str, equal: str, deviation: Deviation) -> list[str]:

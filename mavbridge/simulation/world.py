@@ -109,7 +109,7 @@ class VehicleStepper:
 
 
 class SimulatedCamera:
-    """``ports.Camera`` on the vehicle; a frame is drawn when read, from the pose at exposure.
+    """Camera on the vehicle; a frame is drawn when read, from the pose at exposure.
 
     As in ``sitl``, a frame shows the vehicle's last step and carries that step's stamp, which is
     the middle of the frame. The frame ends ``to_end_ns`` later, and arrives after that. ``render``

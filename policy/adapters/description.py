@@ -53,7 +53,7 @@ _EXTERNAL = re.compile(
 
 
 def is_ordered(names: Sequence[str], roles: Sequence[str]) -> bool:
-    """True unless an argument has the usual name of another of the ``roles`` than its own."""
+    """True unless an argument has the usual name of a different role."""
     places = {name: at for at, role in enumerate(roles) for name in USUAL_NAMES[role]}
     return all(places.get(name, at) == at for at, name in enumerate(names))
 

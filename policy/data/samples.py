@@ -31,7 +31,7 @@ from policy.errors import DatasetError
 from policy.motion.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
-"""Largest distance of a tick from the drawn time: two ticks at 100 Hz."""
+"""Largest distance of a tick from the range of ages: two ticks at 100 Hz."""
 HISTORY_JITTER_S = 0.005
 """Largest shift of the history's sampling times, earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
@@ -144,9 +144,8 @@ class Timeline:
     def _usable_frames(self) -> tuple[Indices, Indices]:
         """Return the images with an attitude at the exposure and a later tick; a tick for each."""
         ticks_ns = self.tick_ns[self._usable_ticks]
-        low = self.captured_ns + self._ages_ns[0] - TICK_TOLERANCE_NS
-        high = self.captured_ns + self._ages_ns[-1] + TICK_TOLERANCE_NS
-        first = np.searchsorted(ticks_ns, np.maximum(low, self.captured_ns), side="left")
+        low, high = self._tick_range(self.captured_ns)
+        first = np.searchsorted(ticks_ns, low, side="left")
         has_tick = first < len(ticks_ns)
         any_tick = np.minimum(first, max(len(ticks_ns) - 1, 0))
         if len(ticks_ns):
@@ -157,15 +156,19 @@ class Timeline:
         usable = np.flatnonzero(has_tick & has_past & ~is_behind)
         return usable, any_tick
 
+    def _tick_range(self, captured_ns: Nanoseconds) -> tuple[Nanoseconds, Nanoseconds]:
+        """Return the first and last time of a tick for each exposure, by the measured ages."""
+        low = np.maximum(captured_ns + self._ages_ns[0] - TICK_TOLERANCE_NS, captured_ns)
+        return low, captured_ns + self._ages_ns[-1] + TICK_TOLERANCE_NS
+
     def draw_ticks(self, frames: Indices, random: np.random.Generator) -> Indices:
         """Draw a tick for each image: the nearest to its exposure plus a measured age."""
         ages = self._ages_ns[random.integers(len(self._ages_ns), size=len(frames))]
         wanted = self.captured_ns[frames] + ages
         ticks_ns = self.tick_ns[self._usable_ticks]
         near = nearest(ticks_ns, wanted)
-        misses = (np.abs(ticks_ns[near] - wanted) > TICK_TOLERANCE_NS) | (
-            ticks_ns[near] < self.captured_ns[frames]
-        )
+        low, high = self._tick_range(self.captured_ns[frames])
+        misses = (ticks_ns[near] < low) | (ticks_ns[near] > high)
         chosen: Indices = self._usable_ticks[np.where(misses, self._any_tick[frames], near)]
         return chosen
 

@@ -33,8 +33,9 @@ from policy.protocol import PolicyRunner, SingleRatePolicy
 
 MIN_COSINE = 0.999
 """Minimum cosine between the two chunks of a sample, taken as vectors."""
-MAX_STICK_ERROR = 0.01
-"""Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
+MAX_ACTION_ERROR = 0.01
+"""Largest difference, of full deflection (5 us of PWM on the usual 1000..2000 us), or of the
+largest value where actions exceed 1, as m/s and rad/s do."""
 SAMPLES = 4
 _NOT_REPEATED = (
     "the same inputs do not give the same chunk again, so it draws random numbers, or keeps "
@@ -92,12 +93,13 @@ def parity_failure(expected: FloatArray, chunks: FloatArray) -> str | None:
         return f"chunks of shape {list(chunks.shape)} instead of {list(expected.shape)}"
     if not np.isfinite(chunks).all():
         return "NaN or infinity in a chunk"
-    furthest = float(np.abs(expected - chunks).max())
+    reach = np.abs(expected).max(axis=(0, 1)).clip(min=1.0)
+    furthest = float((np.abs(expected - chunks) / reach).max())
     cosine = min(_cosine(a, b) for a, b in zip(expected, chunks, strict=True))
-    if furthest <= MAX_STICK_ERROR and cosine >= MIN_COSINE:
+    if furthest <= MAX_ACTION_ERROR and cosine >= MIN_COSINE:
         return None
     return (
-        f"a stick is off by {furthest:.4f} (at most {MAX_STICK_ERROR}), the cosine is "
+        f"an action is off by {furthest:.4f} (at most {MAX_ACTION_ERROR}), the cosine is "
         f"{cosine:.5f} (at least {MIN_COSINE})"
     )
 

@@ -140,7 +140,8 @@ def compile_graph(subject: str, precision: Precision, build: Callable[[], "ov.Mo
     }
     core, code = ov.Core(), hashlib.sha256()
     here = Path(__file__).parent
-    for source in sorted([*here.glob("openvino_*.py"), *here.parent.glob("nets/*.py")]):
+    traced = ("engines/openvino_*.py", "nets/*.py", "*.py", "motion/rotation.py")
+    for source in sorted(path for each in traced for path in here.parent.glob(each)):
         code.update(source.read_bytes())
     facts = [
         core.get_property(DEVICE, n) for n in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")

@@ -168,7 +168,7 @@ def _digest(program: ExportedProgram) -> str:
 
 
 def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
-    """Return the program's weights and constants: its name for each, and the number of uses."""
+    """Yield the name, the tensor and the number of uses of each weight and constant."""
     signature = program.graph_signature
     targets = {
         **signature.inputs_to_parameters,

@@ -152,16 +152,16 @@ def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
 
 def run_in_numpy(name: str) -> Compile:
-    """ "Compile" a function of numpy arrays."""
+    """Return an adapter of numpy functions: checks their results, copies in and out."""
     # In C order, unlike numpy.copy: sums over another order of axes round differently.
     return run_as(name, np.ndarray.copy, np.ndarray, "numpy arrays")
 
 
 def run_as(name: str, convert: Callable[[FloatArray], Any], kind: type, said: str) -> Compile:
-    """ "Compile" a function of arrays of one library: check its result, and keep its arrays apart.
+    """Return an adapter of functions of one library's arrays, which ``convert`` copies to it.
 
-    Copies in and out: published arrays are read-only, and a returned array may be a buffer that the
-    policy overwrites. ``convert`` makes a copy of that library.
+    It checks results, and copies in and out: published arrays are read-only, and a returned array
+    may be a buffer that the policy overwrites.
     """
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:

@@ -82,7 +82,7 @@ def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
 
 def run_eagerly(name: str, device: str) -> Compile:
-    """ "Compile" a function for torch on a device: convert arrays to tensors and back."""
+    """Return an adapter of functions of tensors on a device: converts arrays to them and back."""
     # torch.tensor copies: published arrays are read-only, which torch cannot express.
     run = run_as(name, partial(torch.tensor, device=device), Tensor, "torch tensors")
     return lambda method, shapes: torch.inference_mode()(run(method, shapes))

@@ -39,8 +39,17 @@ def load_builtin(request: PolicyRequest) -> tuple["Toge", list[str]]:
     from policy.nets.toge import Toge
 
     config = builtin_config(request.spec, image_size=request.image_size)
+    kind, *options = request.spec.split(":")
     if (checkpoint := builtin_checkpoint(request)) is not None:
-        return _trained(config, request.spec.split(":")[1:], checkpoint, request.seed)
+        policy, notes = _trained(config, options, checkpoint, request.seed)
+        if kind == "toge-rates" and policy.contract.action != "rates":
+            raise PolicyError(
+                f"{checkpoint} flies by {policy.contract.action}, not by rates as toge-rates does: "
+                "write --policy toge, with --by-rates to close its attitude loop here"
+            )
+        return policy, notes
+    if kind == "toge-rates":
+        raise PolicyError("there is no untrained toge-rates: write --policy toge")
     with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
         torch.manual_seed(request.seed)
         policy = Toge(config).eval()
@@ -76,7 +85,7 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
         raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
     if rest and rest[0] not in BACKBONE_NAMES:
         raise PolicyError(
-            f"--policy toge:{':'.join(options)}: {rest[0]!r} is neither a size "
+            f"--policy {kind}:{':'.join(options)}: {rest[0]!r} is neither a size "
             f"({', '.join(SIZE_NAMES)}) nor an encoder ({', '.join(BACKBONE_NAMES)})"
         )
     return size, rest[0] if rest else None

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
-from policy.contract import QUATERNION, RATE, VELOCITY, ActionKind, FloatArray
+from policy.contract import QUATERNION, RATE, VELOCITY, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.motion.stick_loop import GRAVITY_MPS2
 
@@ -146,13 +146,8 @@ def make_program(name: str, action: ActionKind) -> Program:
 
 Four: TypeAlias = tuple[float, float, float, float]
 
-# ArduCopter at full stick, default parameters; and the dead zone of its throttle.
-FULL_CLIMB_MPS = 2.5
-FULL_LEAN_RAD = math.radians(30.0)
+FULL_LEAN_RAD = math.radians(Contract.full_lean_deg)
 FULL_LEAN_ACCEL_MPS2 = GRAVITY_MPS2 * math.tan(FULL_LEAN_RAD)
-FULL_YAW_RATE_RADPS = math.radians(202.5)
-THROTTLE_DEADZONE = 0.2
-"""Half width of the stick's dead zone, in which the autopilot holds altitude."""
 
 CLIMB_RATE_GAIN = 0.5  # m/s of command per m/s of climb-rate error
 LEAN_PER_MPS = 0.3  # share of full lean per m/s: closes in 0.6 s, slower than a lean builds up
@@ -252,7 +247,7 @@ def _pushed(kind: ActionKind, wanted: Motion, outputs: dict[Axis, float]) -> dic
 def sticks(wanted: Motion, measured: Measured, climb: Climb) -> Four:
     """Return throttle, yaw, pitch, roll: +pitch leans forward, +roll leans right."""
     pitch, roll = _leans(wanted, measured)
-    yaw = clip(_yaw_rate(wanted, measured) / FULL_YAW_RATE_RADPS, 1.0)
+    yaw = clip(_yaw_rate(wanted, measured) / math.radians(Contract.full_yaw_rate_degps), 1.0)
     throttle = _throttle(measured, climb)
     out = _pushed("sticks", wanted, {"climb": throttle, "yaw": yaw, "pitch": pitch, "roll": roll})
     return out["climb"], out["yaw"], out["pitch"], out["roll"]
@@ -262,8 +257,9 @@ def _throttle(measured: Measured, climb: Climb) -> float:
     if climb.is_held:
         return 0.0
     command = climb.wanted_mps + CLIMB_RATE_GAIN * (climb.wanted_mps - measured.climb_mps)
-    beyond_deadzone = (1 - THROTTLE_DEADZONE) * command / FULL_CLIMB_MPS
-    return clip(math.copysign(THROTTLE_DEADZONE, command) + beyond_deadzone, 1.0)
+    dead_zone = Contract.throttle_dead_zone
+    beyond = (1 - dead_zone) * command / Contract.full_climb_mps
+    return clip(math.copysign(dead_zone, command) + beyond, 1.0)
 
 
 def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:

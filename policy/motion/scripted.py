@@ -107,7 +107,7 @@ class ScriptedPolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """Return a chunk [1, 16, 4] for a state [1, 13] in ``ned_frd``; ignores the rest.
+        """Return a chunk [1, horizon, 4] for a state [1, 13] in ``ned_frd``; ignores the rest.
 
         Each action is the program's motion at its own time, with the current feedback.
         """

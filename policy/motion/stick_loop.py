@@ -255,8 +255,8 @@ class StickLoop:
         tilt_p = rates[:, 1] - yaw_rate * down_body[:, 0]
         tilt_q = rates[:, 2] - yaw_rate * down_body[:, 1]
         # Inverse of _tilt_rates: the turn of the thrust axis that leads to these rates.
-        angle = np.hypot(tilt_p, tilt_q) / TILT_GAIN_PER_S
-        share = np.sinc(angle / np.pi) / TILT_GAIN_PER_S
+        angle = np.hypot(tilt_p, tilt_q) / self.tilt_gain_per_s
+        share = np.sinc(angle / np.pi) / self.tilt_gain_per_s
         wanted_body = np.stack([-share * tilt_q, share * tilt_p, -np.cos(angle)], axis=-1)
         north, east, down = rotate(attitude, wanted_body).T
         forward, _, _ = matrix_columns(*attitude.T)

@@ -63,7 +63,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     ) -> None:
         self.settings: TrainSettings = settings
         self._network = network
-        self._ages_ns = _ages(flights, settings)
+        measured_ns = _ages(flights, settings)
+        self._ages_ns = measured_ns if len(measured_ns) else _evenly(USUAL_AGES_MS)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
@@ -74,8 +75,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         )
         steps = network.schedule.num_train_timesteps
         self._batches = Batches(timeline, kept, self.images, timesteps=steps, settings=settings)
-        is_measured = any((flight.age_ns > 0).any() for flight in flights)
-        if settings.ages is None and not is_measured:
+        if len(measured_ns) == 0:
             low_ms, high_ms = USUAL_AGES_MS
             self.note(
                 f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
@@ -156,8 +156,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
     """Return sorted image ages to train for: measured ones, or a uniform range.
 
-    If no policy flew, as in a human pilot's flights, the usual range. An image that stayed for
-    seconds, as of a camera that paused, is not flown by.
+    None if no policy flew, as in a human pilot's flights. An image that stayed for seconds, as of a
+    camera that paused, is not flown by.
     """
     if settings.age_range_ms is not None:
         return _evenly(settings.age_range_ms)
@@ -168,7 +168,7 @@ def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds
     usable = np.sort(ages[(ages > 0) & (ages <= MAX_AGE_MS * NS_PER_MS)])
     if len(usable) == 0 and settings.ages is not None:
         raise DatasetError(f"--ages {settings.ages}: each image in it was over {MAX_AGE_MS} ms old")
-    return usable if len(usable) else _evenly(USUAL_AGES_MS)
+    return usable
 
 
 def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:

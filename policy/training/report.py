@@ -19,6 +19,11 @@ class PolicyValidation:
     hold_error: float | None
     """Error of holding the newest stick of the history; None by rates, without sent sticks."""
 
+    @property
+    def selected_by(self) -> float:
+        """Figure of which the lowest is kept: the error of what flies."""
+        return self.stick_error
+
     def describe(self) -> str:
         """Return one line for the user."""
         held = "" if self.hold_error is None else f", last stick held {self.hold_error:.3f}"
@@ -43,6 +48,11 @@ class WorldModelValidation:
     """Mean length of the velocity error in the last imagined state."""
     held_velocity_error_mps: float
     """Mean length of the velocity error if the velocity is held constant."""
+
+    @property
+    def selected_by(self) -> float:
+        """Figure of which the lowest is kept."""
+        return self.loss
 
     def describe(self) -> str:
         """Return one line for the user."""

@@ -306,7 +306,8 @@ class TrainingRun(ABC, Generic[M, B]):
             self._write_log(stage, validation=asdict(validation))
         if stage.trains_encoder and self.encoder_learns_alone:
             return
-        if validation is None or self._best is None or validation.loss < self._best.loss:
+        best = self._best
+        if validation is None or best is None or validation.selected_by < best.selected_by:
             self._best, self._is_exported = validation, True
             self.export()
 

@@ -114,8 +114,10 @@ def check_vehicle(
     if config.link.connect == NO_VEHICLE:
         return [_link_row("vehicle", "none", "none for this check")]
     print_status(f"listening to the vehicle on {config.link.connect}")
-    is_dual = plan is None or plan.is_dual
-    settings = link_settings(config, config.rates.loops(is_dual=is_dual))
+    # As a flight asks for, before its policy is known.
+    settings = link_settings(
+        config, config.rates.loops(is_dual=config.policy.dual_rate is not False)
+    )
     settings = replace(settings, readonly=True, set_params=())
     rows: list[CheckRow] = []
     try:

@@ -12,6 +12,7 @@ from policy.checkpoints.networks import save_checkpoint
 from policy.contract import Contract, FloatArray
 from policy.engines.runner import level_state
 from policy.errors import NoChunkError, PolicyError, Warned
+from policy.loading.builtin import SHIPPED
 from policy.loading.load import read_policy_contract
 from policy.loading.request import PolicyRequest, measure_times
 from policy.motion.stick_loop import StickLoop, by_rates
@@ -92,6 +93,8 @@ def test_a_checkpoint_decides_what_is_built(checkpoint: Path, small_toge: Toge) 
         ("json.decoder:Nothing", {}, "no class Nothing"),
         ("policy:Mine", {}, "a file of that name flies by its path: --policy ./policy.py:Mine"),
         ("scripted:yaw", {"by_rates": True}, "--by-rates is for toge"),
+        ("toge-rates", {"checkpoint": SHIPPED}, "toge.safetensors flies by sticks, not by rates"),
+        ("toge-rates", {"allow_untrained": True}, "no untrained toge-rates"),
     ],
 )
 def test_refusals_name_the_next_step(spec: str, changes: dict[str, Any], message: str) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import statistics
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,9 @@ def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(tmp_path: Path
     assert written("nominal", "second") == first
     nominal, random = json.loads(first), json.loads(written("random", "third"))
     assert nominal["summary"]["outcomes"] == {"timed out": 2}
-    assert (nominal["asked_episodes"], nominal["vision_delay_ms"]) == (2, 0.0)
-    assert (nominal["conditions"], random["conditions"]) == ("nominal", "random")
+    assert (nominal["flags"]["episodes"], nominal["flags"]["vision_delay"]) == (2, 0.0)
+    assert (nominal["flags"]["conditions"], random["flags"]["conditions"]) == ("nominal", "random")
+    assert nominal["flags"]["policy"]["policy"] == CIRCLE.policy
     for a, b in zip(nominal["episodes"], random["episodes"], strict=True):
         assert a["distance_m"] != b["distance_m"]
 
@@ -180,3 +182,12 @@ def test_the_interval_of_a_mean_is_that_of_its_standard_error() -> None:
     # Mean 49.5, deviation 28.87, standard error 2.887.
     assert spread.low == pytest.approx(49.5 - 1.96 * 2.887, abs=0.3)
     assert spread.high == pytest.approx(49.5 + 1.96 * 2.887, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("count", "t"), [(2, 12.706), (3, 4.303), (4, 3.182), (5, 2.776), (11, 2.228), (31, 2.042)]
+)
+def test_the_interval_of_few_flights_is_students(count: int, t: float) -> None:
+    values = [float(value) for value in range(count)]
+    half = t * statistics.stdev(values) / math.sqrt(count)
+    assert mean(values).high - mean(values).value == pytest.approx(half, rel=0.01)

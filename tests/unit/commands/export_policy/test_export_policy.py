@@ -56,5 +56,5 @@ def test_files_that_are_another_policy_are_not_praised(
 
     monkeypatch.setattr(convert, "chunks_of_samples", chunks_of_samples)
     config = ExportPolicyConfig(out=tmp_path / "toge")
-    with pytest.raises(UserError, match=r"another policy: a stick is off by 0\.02"):
+    with pytest.raises(UserError, match=r"another policy: an action is off by 0\.02"):
         export_policy(None, config)

@@ -64,8 +64,9 @@ def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None
 
     assert changed.limits == replace(FLOWN.limits, tau=0.1)
     assert changed.policy == replace(FLOWN.policy, num_diffusion_steps=2)
-    other = other_config(FLOWN, ReplayConfig(policy="scripted:hover"))
-    assert (other.policy.checkpoint, other.policy.seed) == (None, 3)
+    flown = replace(FLOWN, policy=replace(FLOWN.policy, by_rates=True, image_size=64))
+    other = other_config(flown, ReplayConfig(policy="scripted:hover")).policy
+    assert other == PolicyConfig(policy="scripted:hover", seed=3)
 
 
 @pytest.mark.parametrize(

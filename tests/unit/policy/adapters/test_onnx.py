@@ -127,14 +127,14 @@ def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> No
 
 
 def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
-    failures = iter(["a stick is off", "a stick is off"])
+    failures = iter(["an action is off", "an action is off"])
     monkeypatch.setattr(
         "policy.adapters.onnx.precisions", lambda: (("bf16", "bf16"), ("f32", "f32"))
     )
     monkeypatch.setattr(choose, "parity_failure", lambda *_: next(failures))
     loaded = load(f"onnx:{exported_toge}")
     assert loaded.runner.engine == "openvino-f32"
-    assert "openvino-bf16 is passed over: a stick is off" in "".join(loaded.notes)
+    assert "openvino-bf16 is passed over: an action is off" in "".join(loaded.notes)
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,21 @@ def test_ticks_are_drawn_at_measured_ages() -> None:
     assert near.mean(axis=0) == pytest.approx([1 / 3, 1 / 3], abs=0.08)
 
 
+def test_of_rows_100_ms_apart_the_nearest_to_a_drawn_age_is_taken() -> None:
+    """Not each time the first one after the exposure, as if no image were old."""
+    flight = flown(600)
+    names = ("tick_ns", "attitude_ns", "velocity_ns", "state")
+    rows = {name: getattr(flight, name)[::10] for name in names}
+    images = {"captured_ns": rows["tick_ns"], "gate": flight.gate[: len(rows["tick_ns"])]}
+    line = timeline(replace(flight, **rows, **images, age_ns=np.arange(20, 91) * MS))
+    frames = np.repeat(line.frames, 20)
+    ticks = line.draw_ticks(frames, np.random.default_rng(0))
+    age_ms = (line.tick_ns[ticks] - line.captured_ns[frames]) / MS
+    assert age_ms.min() >= 0
+    assert age_ms.max() <= 110
+    assert age_ms.mean() == pytest.approx(55, abs=5)
+
+
 def test_a_history_in_training_is_often_gone_and_never_exact() -> None:
     line = timeline(flown())
     ticks = np.full(4000, 100)

@@ -16,7 +16,13 @@ from helpers import torch_policies
 from helpers.torch_policies import TwoRates, changed
 from policy.contract import FloatArray
 from policy.engines import openvino_modules
-from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
+from policy.engines.choose import (
+    MAX_ACTION_ERROR,
+    Candidate,
+    choose_runner,
+    first_that_agrees,
+    parity_failure,
+)
 from policy.engines.runner import EngineName, ExecutionSettings
 from policy.engines.torch_engines import make_torch_runner
 from policy.errors import PolicyError
@@ -123,14 +129,20 @@ def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidat
 
 def one_bad_stick(chunk: FloatArray) -> FloatArray:
     chunk = chunk.copy()
-    chunk[0, 7, 2] += 2 * MAX_STICK_ERROR
+    chunk[0, 7, 2] += 2 * MAX_ACTION_ERROR
     return chunk
+
+
+def test_actions_in_metres_a_second_are_compared_by_their_size() -> None:
+    velocities = np.random.default_rng(0).uniform(-8.0, 8.0, (4, 16, 4)).astype(np.float32)
+    assert parity_failure(velocities, velocities + 0.05) is None
+    assert parity_failure(velocities / 8, velocities / 8 + 0.05) is not None
 
 
 @pytest.mark.parametrize(
     ("alter", "reason"),
     [
-        (one_bad_stick, r"a stick is off by 0\.02"),
+        (one_bad_stick, r"an action is off by 0\.02"),
         (np.zeros_like, r"the cosine is 0\.0"),
         (lambda chunk: np.full_like(chunk, np.nan), "NaN or infinity"),
         (lambda chunk: chunk[:, :8], r"chunks of shape \[4, 8, 4\]"),
