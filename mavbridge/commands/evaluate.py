@@ -316,10 +316,14 @@ def print_evaluation(
         label = f"{shown}, of {episodes[0].gates_total}" if name == "gates_passed" else shown
         rows.append((label, *_cells(summary[name], "{:.2f}")))
     title = [f"{config.policy.policy} ({_engine(flown)})"]
-    title += [f"{n} {getattr(config.policy, n)}" for n in config.policy.given("policy")]
     flags, usual = _flags(config), EvaluateConfig(policy=config.policy, episodes=config.episodes)
-    changed = {n: value for n, value in vars(flags).items() if value != getattr(usual, n)}
-    title += [f"{n} {value}" for n, value in changed.items() if not is_dataclass(value)]
+    changed = {n: getattr(config.policy, n) for n in config.policy.given("policy")}
+    changed |= {n: value for n, value in vars(flags).items() if value != getattr(usual, n)}
+    title += [
+        f"{name.replace('_', ' ')} {value}"
+        for name, value in changed.items()
+        if not is_dataclass(value)
+    ]
     header = ("", "mean", "95 % interval", "flights")
     console.print(make_table(", ".join(title), header, rows))
     ends = ", ".join(f"{count} {outcome}" for outcome, count in _outcomes(episodes).items())

@@ -119,7 +119,7 @@ def test_ctrl_c_ends_with_the_results_so_far(
     shown = capsys.readouterr()
     assert "interrupted after 2 of 5 episodes" in shown.err
     assert shown.err.count("mind the gap") == 1
-    assert "images 50 ms later" in shown.out
+    assert "vision delay 50.0" in shown.out
     assert "2 flights: 1 finished, 1 crashed" in shown.out
 
 
