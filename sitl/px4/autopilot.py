@@ -14,7 +14,7 @@ from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, Px4Sticks
 from sitl.vehicle.config import VehicleConfig
-from sitl.vehicle.firmware import STOPPED
+from sitl.vehicle.firmware import STOPPED, VelocitySetpoint
 
 RESTING_PERIOD_NS = 300 * NS_PER_S // 1000
 """PX4 reads a receiver whose channels do not change only at this period (``rc_update``)."""
@@ -137,7 +137,9 @@ class Px4(Commander):
         ):
             self._ramp_ns, self.flight.most_climb_mps = None, math.inf
             return False
-        if not self.flight.is_direct(self.mode, self.setpoint):
+        is_velocity = isinstance(self.setpoint, VelocitySetpoint)
+        is_thrust = self.mode is Px4Mode.OFFBOARD and not is_velocity
+        if not (self.mode.manual_throttle or is_thrust):
             self._ramp_ns = self.now_ns if self._ramp_ns is None else self._ramp_ns
             if self.flight.most_climb_mps <= 0.0 or math.isinf(self.flight.most_climb_mps):
                 return False

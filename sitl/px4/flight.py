@@ -100,11 +100,6 @@ class Px4Control:
             return self._offboard_climb_mps(setpoint) > TAKEOFF_CLIMB_MPS
         return setpoint.thrust > 0.9 * HOVER_THRUST
 
-    @staticmethod
-    def is_direct(mode: Px4Mode, setpoint: Setpoint | None) -> bool:
-        is_velocity = isinstance(setpoint, VelocitySetpoint)
-        return mode.manual_throttle or (mode is Px4Mode.OFFBOARD and not is_velocity)
-
     def fly(
         self,
         mode: Px4Mode,

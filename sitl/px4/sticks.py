@@ -16,7 +16,7 @@ from sitl.vehicle.rotation import length
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
-"""Sticks are checked at each arrival and, without one, at this period."""
+"""Sticks are checked at each arrival or after this period, and once a second for the switches."""
 FAST_SAMPLES = 3
 """1.18: consecutive movements in one direction that count as a pilot's (MIN_SIGN_CONSECUTIVE).
 Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
@@ -86,7 +86,7 @@ class StickInput:
         """Samples of sources that did not win, since the last check."""
         self._never_ages = False
         self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
-        self._looked_ns = 0
+        self._looked_ns = self._switches_ns = 0
 
     @property
     def source(self) -> int | None:
@@ -101,25 +101,28 @@ class StickInput:
         if self._wins(source):
             self._source = source
             self._choose(sticks, now_ns)
-        else:
-            self._unread[source] = sticks
+            return
+        self._unread[source] = sticks
+        if source == RC_SOURCE and now_ns - self._switches_ns >= NS_PER_S:
+            self._switches_ns = now_ns
+            self._check(now_ns)
 
     def update(self, now_ns: int) -> None:
         """Check sticks between arrivals, and detect the loss of the winner."""
-        if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
+        if now_ns - self._looked_ns >= POLL_NS:
+            self._check(now_ns)
+
+    def _check(self, now_ns: int) -> None:
+        lost_after_ns = round(self._params["COM_RC_LOSS_T"], 6) * NS_PER_S
+        if self.valid and not self._never_ages and now_ns - self.sampled_ns >= lost_after_ns:
             unread, self._unread, self.valid = self._unread, {}, False
             for source, sticks in unread.items():  # one that follows in this check: no failsafe
                 self.on_sticks(source, sticks, now_ns)
             if not self.valid:
                 self.count, self.moved_fast = self.count + 1, False
                 self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
-        if self.valid and now_ns - self._looked_ns >= POLL_NS:
+        elif self.valid:
             self._look(now_ns)
-
-    @property
-    def _lost_after_ns(self) -> int:
-        polls = math.ceil(self._params["COM_RC_LOSS_T"] * NS_PER_S / POLL_NS - 1e-6)
-        return max(1, polls) * POLL_NS
 
     def _wins(self, source: int) -> bool:
         mode = self._params.integer("COM_RC_IN_MODE")

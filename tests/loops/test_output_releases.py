@@ -292,23 +292,27 @@ def test_a_pilot_who_chooses_hold_in_that_failsafe_keeps_it() -> None:
     assert flight.px4.mode_name == "AUTO.LOITER", flight.describe()
 
 
-def over_an_idle_receiver(autopilot: AutopilotName) -> OutputFlight:
+def over_an_idle_receiver(autopilot: AutopilotName, flown_s: float = 1.2) -> OutputFlight:
     """A flight whose vehicle follows a receiver with its throttle down, should it miss us."""
     flight = OutputFlight(autopilot, "sticks")
     if flight.is_px4:
         fall_back(flight, *IDLE_US)
     flight.vehicle.set_receiver(IDLE_US)
-    return flight.fly(1.2)
+    return flight.fly(flown_s)
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "is_moved"), [("px4", False), ("px4", True), ("ardupilot", True)]
+    ("autopilot", "flown_s", "is_moved"),
+    [("px4", 1.2, False), ("px4", 1.225, False), ("px4", 1.2, True), ("ardupilot", 1.2, True)],
 )
 def test_unheard_sticks_are_followed_by_a_hold_and_only_by_a_pilot_whose_hand_is_seen(
-    autopilot: AutopilotName, is_moved: bool
+    autopilot: AutopilotName, flown_s: float, is_moved: bool
 ) -> None:
-    """A PX4 was released to the throttle and sank; a pilot of an ArduPilot was braked."""
-    flight = over_an_idle_receiver(autopilot)
+    """A PX4 was released to the throttle and sank; a pilot of an ArduPilot was braked.
+
+    At 1.225 s PX4 showed the throttle before our sticks had been constant for too long.
+    """
+    flight = over_an_idle_receiver(autopilot, flown_s)
     silence(flight, up_s=4.0)
     if is_moved:
         later(flight, 3.5, lambda: flight.vehicle.set_receiver((1700, 1500, 1500, 1500)))
