@@ -60,9 +60,9 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
     contract's order; the output has one number fewer than the input, 12 or 19.
     """
     vx, vy, vz, w, x, y, z, *rest = columns
-    forward, side, up = matrix_columns(w, x, y, z)
-    velocity_body = [vx * a + vy * b + vz * c for a, b, c in (forward, side, up)]
-    return [*velocity_body, forward[2], side[2], up[2], *rest]
+    axes = matrix_columns(w, x, y, z)
+    velocity_body = [vx * a + vy * b + vz * c for a, b, c in axes]
+    return [*velocity_body, *(axis[2] for axis in axes), *rest]
 
 
 def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:

@@ -124,8 +124,8 @@ def predict_by_steps(
     return self.to_chunk(sample)
 
 
-def keep_nothing() -> None:
-    """No-op: the reset of a policy without state between chunks."""
+def no_op() -> None:
+    """Do nothing: the default of a runner's ``close`` and ``reset``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +149,15 @@ class PolicyRunner:
     """(joined images [1, *contract.feature_shape], or without a fast path [1,
     *contract.image_shape]; state [1, *contract.state_shape]; history
     [1, *contract.history_shape]) -> chunk [1, horizon, 4]."""
-    close: Callable[[], None] = keep_nothing
+    close: Callable[[], None] = no_op
     """Release the policy's resources; called once, after the last call of the other functions."""
-    reset: Callable[[], None] = keep_nothing
+    reset: Callable[[], None] = no_op
     """Forget earlier flights; called when a flight begins."""
+
+    @property
+    def has_state(self) -> bool:
+        """True if the policy keeps something from chunk to chunk, so that it needs a reset."""
+        return self.reset is not no_op
 
     def join(self, encoded: Sequence[Sequence[FloatArray]]) -> FloatArray:
         """Combine the encoded images of each camera at each observation, oldest first, for ``act``.

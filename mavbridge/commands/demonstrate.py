@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from shutil import rmtree
 
-from mavbridge.commands.demonstrate_pilot import Pilot, Variation, draw_variation
+from mavbridge.commands.demonstrate_expert import ExpertAndStudent, Variation, draw_variation
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar, text_console
 from mavbridge.config.episodes import COURSE_SEEDS, MAX_EPISODES, DemonstrateConfig
@@ -67,16 +67,18 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
             vehicle=make_vehicle(autopilot=config.autopilot, conditions=variation.conditions),
         )
         contract, student = _terms(spec, longest_solve_ns, flight.clock, stack)
-        pilot = Pilot(flight, variation, speed_mps=config.speed, contract=contract, student=student)
-        meta = _meta(spec, variation, pilot.runner, flight.clock.now_ns())
+        expert = ExpertAndStudent(
+            flight, variation, speed_mps=config.speed, contract=contract, student=student
+        )
+        meta = _meta(spec, variation, expert.runner, flight.clock.now_ns())
         writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
         stack.callback(writer.close)
         result = flight.fly(
-            pilot.runner,
+            expert.runner,
             max_time_s=config.max_time,
             run_out_s=variation.hover_s,
             ends_by_stop=False,
-            sinks=(_LabelledRecorder(flight, pilot, writer),),
+            sinks=(_LabelledRecorder(flight, expert, writer),),
             should_stop=should_stop,
         )
         log = flight.vehicle.log
@@ -147,9 +149,11 @@ def _meta(
 class _LabelledRecorder:
     """``TickSink`` that records the flight with labels, from the start of the demonstration."""
 
-    def __init__(self, flight: SimulatedFlight, pilot: Pilot, writer: FlightWriter) -> None:
+    def __init__(
+        self, flight: SimulatedFlight, expert: ExpertAndStudent, writer: FlightWriter
+    ) -> None:
         self._flight = flight
-        self._pilot = pilot
+        self._expert = expert
         self._writer = writer
         self._truths: dict[int, FrameTruth] = {}
         self._ticks = self._frames = 0
@@ -173,7 +177,7 @@ class _LabelledRecorder:
 
         Numbers count from the first recorded one.
         """
-        from_ns = self._pilot.begin_ns
+        from_ns = self._expert.begin_ns
         if from_ns is None:
             return
         if not isinstance(event, Tick):
@@ -183,7 +187,7 @@ class _LabelledRecorder:
                 self._frames += 1
         elif event.woke_ns >= from_ns and event.chunk_serial not in (None, self._chunk_serial):
             self._chunk_serial = event.chunk_serial
-            label = self._pilot.expert_actions.pop(event.chunk_serial, None)
+            label = self._expert.expert_actions.pop(event.chunk_serial, None)
             self._writer.tick(replace(event, serial=self._ticks), label)
             self._ticks += 1
 

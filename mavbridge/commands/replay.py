@@ -56,7 +56,7 @@ from mavbridge.simulation.replay.guard import (
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
 from policy.errors import NoChunkError
-from policy.protocol import PolicyRunner, keep_nothing
+from policy.protocol import PolicyRunner
 
 VIDEO_TOLERANCE = 0.15
 """Tolerance of a smoothed stick for the lossy video, in full deflections: twice that measured."""
@@ -118,7 +118,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         ),
     )
     if compared and result.problems and not is_stateless(wanted.policy):
-        told = forgotten(compared, has_reset=runner.reset is not keep_nothing)
+        told = forgotten(compared, has_reset=runner.has_state)
         result = replace(result, gaps=(*result.gaps, *told))
     print_replay(result, table_console())
     # JSON lacks NaN, as of a chunk that was not finite.

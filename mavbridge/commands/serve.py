@@ -40,7 +40,7 @@ from policy.adapters.websocket.messages import (
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY, API_KEY_VARIABLE
 from policy.errors import PolicyError
 from policy.loading.load import check_request
-from policy.protocol import PolicyRunner, keep_nothing
+from policy.protocol import PolicyRunner
 
 MAX_CLIENTS = 4
 SPARE_BYTES = 2**20
@@ -73,7 +73,7 @@ class PolicyServer:
         self._report = report
         self._clients = 0
         # One only if the policy has state: two flights would share it.
-        self._max_clients = MAX_CLIENTS if runner.reset is keep_nothing else 1
+        self._max_clients = 1 if runner.has_state else MAX_CLIENTS
         self._policy = ThreadPoolExecutor(1, "mavbridge-policy")
         self.ended: Future[None] = Future()
         """Done once ``end`` was called; holds an error of the policy that is a bug."""

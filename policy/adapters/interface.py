@@ -57,11 +57,11 @@ def state_values(
     if set(wanted) & set(EGOCENTRIC_NAMES):
         known |= dict(zip(EGOCENTRIC_NAMES, egocentric_columns(base), strict=False))
     if set(wanted) & set(EULER_NAMES):
-        forward, side, up = matrix_columns(*base[QUATERNION])
-        level = (forward[0] * forward[0] + forward[1] * forward[1]) ** 0.5
-        known["roll_rad"] = arctan2(side[2], up[2])
-        known["pitch_rad"] = arctan2(-forward[2], level)
-        known["yaw_rad"] = arctan2(forward[1], forward[0])
+        x_axis, y_axis, z_axis = matrix_columns(*base[QUATERNION])
+        level = (x_axis[0] * x_axis[0] + x_axis[1] * x_axis[1]) ** 0.5
+        known["roll_rad"] = arctan2(y_axis[2], z_axis[2])
+        known["pitch_rad"] = arctan2(-x_axis[2], level)
+        known["yaw_rad"] = arctan2(x_axis[1], x_axis[0])
     return [known[name] for name in wanted]
 
 

@@ -32,7 +32,7 @@ from policy.loading.request import (
 from policy.motion.scripted import IN_AIR, ScriptedPolicy, make_scripted
 from policy.motion.stick_loop import by_rates, flown_by_rates
 from policy.nets.names import BUILTIN_KINDS
-from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep_nothing
+from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, no_op
 
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
@@ -113,7 +113,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     try:
         settings = _settings(policy, request, notes)
         runner, engine_notes = (make_runner or partial(_on_engine, policy, request))(settings)
-        if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
+        if not runner.has_state:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)
         times, doubts = measure_times(runner, now_s), unit_notes(runner)
         runner.reset()  # forget the dummy samples
@@ -257,7 +257,7 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
         method: Callable[[], object] | None = getattr(policy, name, None)
         with_torch = policy.contract.arrays == "torch"
     if method is None:
-        return keep_nothing
+        return no_op
     if any(is_kind(method) for is_kind in _NOT_PLAIN):
         raise PolicyError(f"{spec}: {name} is async or a generator: make it a plain method")
 

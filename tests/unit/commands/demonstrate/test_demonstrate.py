@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mavbridge.commands.demonstrate import DemonstrationSpec, demonstrate, fly_demonstration
-from mavbridge.commands.demonstrate_pilot import TurnSchedule, draw_variation, from_now
+from mavbridge.commands.demonstrate_expert import TurnSchedule, draw_variation, from_now
 from mavbridge.commands.train import fit_to_flights
 from mavbridge.config.episodes import COURSE_SEEDS, AutopilotKind, DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
@@ -240,7 +240,7 @@ def test_labels_are_of_the_rows_own_solves_if_the_student_refuses_some(
 ) -> None:
     (tmp_path / "mine.py").write_text(REFUSING)
     monkeypatch.setattr(
-        "mavbridge.commands.demonstrate_pilot.expert_sticks",
+        "mavbridge.commands.demonstrate_expert.expert_sticks",
         lambda _guide, _body, now_s: Sticks(0.0, 0.0, 0.0, now_s / 1e4),  # when it was asked
     )
     policy = PolicyConfig(policy=f"{tmp_path}/mine.py:Single", seed=3)

@@ -34,7 +34,7 @@ from policy.errors import PolicyError, Warned
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.toge import Toge
-from policy.protocol import PolicyRunner, keep_nothing
+from policy.protocol import PolicyRunner
 
 STEPS = 4
 
@@ -215,7 +215,7 @@ def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: st
     graphs.describe(tmp_path, outputs={"chunk": "actions"})
     runner = fly(f"onnx:{tmp_path}")
     assert act(runner, vx_mps=2.0)[0] == pytest.approx([0.2] * 4, abs=1e-3)
-    assert runner.reset is keep_nothing, "a server shares it among clients"
+    assert not runner.has_state, "a server shares it among clients"
 
 
 def test_state_and_actions_are_in_the_order_and_units_of_the_contract_file(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def _random_delays(random: np.random.Generator) -> Delays:
     )
 
 
-class Pilot:
+class ExpertAndStudent:
     """Computes the expert's action at every solve; its runner flies."""
 
     def __init__(
