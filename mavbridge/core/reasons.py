@@ -20,7 +20,7 @@ class Kind(Enum):
     """Party responsible for a reason."""
 
     WAITING = "waiting"
-    """None: something has not arrived yet, or was not requested."""
+    """Nobody: something has not arrived yet, or was not requested."""
     PILOT = "pilot"
     """The pilot or an operator, by an explicit act."""
     VEHICLE = "vehicle"

@@ -19,7 +19,7 @@ INTERRUPTED = 130
 ONE_REQUEST_NS = 250 * NS_PER_MS
 """Signals closer together are one request. A closing terminal sends SIGHUP more than once, and a
 parent program may pass on a Ctrl-C that the terminal has sent to both."""
-LAST_WORDS_S = 1.0
+FLUSH_S = 1.0
 """Longest wait for the console to take the last output before the process exits."""
 EXIT_S = 5.0
 """Longest wait for exit handlers, and for threads and pools that a policy has left."""
@@ -171,7 +171,7 @@ def end_process(
     """Exit with ``status`` after calling ``say``, without blocking on the console.
 
     An ordinary exit flushes standard output and error, and blocks for ever if another thread sleeps
-    in a write to them or their reader has stalled. Here the flush is tried for ``LAST_WORDS_S``; if
+    in a write to them or their reader has stalled. Here the flush is tried for ``FLUSH_S``; if
     it does not succeed, the process exits at once, without exit handlers. An ordinary exit would
     also wait for threads of a policy: with ``must_exit``, the process ends after ``EXIT_S``.
     """
@@ -186,10 +186,10 @@ def end_process(
         stop.wait(EXIT_S)
         os._exit(status)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would cut the last words short
-    last_words = Worker("mavbridge-last-words", finish)
-    last_words.start()
-    if not last_words.ends_within(LAST_WORDS_S):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would cut the output short
+    flush = Worker("mavbridge-flush", finish)
+    flush.start()
+    if not flush.ends_within(FLUSH_S):
         os._exit(status)
     if must_exit:
         Worker("mavbridge-late-end", end_late).start()

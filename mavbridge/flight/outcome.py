@@ -191,7 +191,7 @@ def flight_verdict(
     """Return the exit status of a flight that ended without an exception, and why it is not 0.
 
     Args:
-        summary: the guard's last words; None where it goes on without us.
+        summary: the guard's summary; None where it goes on without us.
         stop: the signals that have come.
         reason: why the policy does not fly now, from the last tick.
         readonly: nothing was sent, so there was nothing to fly.

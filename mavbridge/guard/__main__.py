@@ -32,7 +32,7 @@ from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import make_transport
 
-LAST_WORDS_S = 2.0
+SUMMARY_S = 2.0
 """Longest wait [s] for a busy flight process to read the last message; control is given back."""
 LEAD_NS = 150 * NS_PER_MS // 1000
 """Time from the decision to its slot [ns]: the least time that the work before a send takes.
@@ -54,11 +54,11 @@ def main() -> None:
             _run(settings, port, samples, stack)
     except MavbridgeError as error:
         kind = UserError if isinstance(error, UserError) else PeerError
-        port.finish(encode(kind(str(error))), LAST_WORDS_S)
+        port.finish(encode(kind(str(error))), SUMMARY_S)
         sys.exit(1)
     except Exception:  # noqa: BLE001 - the flight process shows it
         failed = f"the guard process has failed, a bug of mavbridge:\n{traceback.format_exc()}"
-        port.finish(encode(GuardDiedError(failed)), LAST_WORDS_S)
+        port.finish(encode(GuardDiedError(failed)), SUMMARY_S)
         sys.exit(2)
 
 
@@ -101,7 +101,7 @@ def _run(settings: GuardSettings, port: SocketPort, samples: SocketPort, stack: 
         dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,
     )
-    port.finish(encode(summary), LAST_WORDS_S)
+    port.finish(encode(summary), SUMMARY_S)
 
 
 def say_on(terminal: Path, text: str) -> None:

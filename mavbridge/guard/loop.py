@@ -232,7 +232,7 @@ class GuardLoop:
     def _has_work(self, known: object, given: GuardInput, at_ns: int, slot_ns: int) -> bool:
         """True if the guard must step.
 
-        False in flight, between slots, within 10 ms of a step, if only motion has changed.
+        In flight, between slots and within 10 ms of a step, motion alone is no reason.
         """
         is_called = given.chunk or given.absence or given.act or given.stop or given.command_fault
         is_due = at_ns >= min(slot_ns, self._stepped_ns + IDLE_PERIOD_NS)

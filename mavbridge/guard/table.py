@@ -311,11 +311,11 @@ def _is_mode_ours(m: Memory, now: EngagementInputs) -> bool:
 
 
 def _failsafe(m: Memory, now: EngagementInputs, *, keeps_mode: bool) -> Reason | None:
-    """Return the reason if an armed vehicle is in a failsafe that keeps our mode, or in another.
+    """Return why an armed vehicle is in a failsafe, or None.
 
-    ``keeps_mode`` tells which of the two is asked for; None if the vehicle is not in such a one.
-    ArduPilot reports a failsafe together with the mode that it sets. PX4 may report it earlier, so
-    that our mode tells nothing there.
+    ``keeps_mode``: True asks for one that left our mode, False for one that changed it. ArduPilot
+    reports a failsafe together with the mode that it sets. PX4 may report it earlier, so that our
+    mode tells nothing there.
     """
     is_kept = _is_mode_ours(m, now) and not now.link.modes.needs_setpoints_first
     if not (now.status.is_failsafe and now.status.armed) or is_kept is not keeps_mode:

@@ -1,6 +1,6 @@
 """Recorded flights on disk, in the format of docs/formats.md.
 
-    vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> tables
+    loops and TelemetryCache --emit--> Recorder (its own thread) --> FlightWriter --> tables
                                                                          |
                                       VideoWriter: frames through shared memory
                                                                          v

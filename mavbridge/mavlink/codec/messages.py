@@ -1,4 +1,4 @@
-"""Records of the MAVLink messages that the bridge uses: frozen, in SI units, checked."""
+"""Records of the MAVLink messages that mavbridge uses: frozen, in SI units, checked."""
 
 import struct
 from typing import NamedTuple, TypeAlias

@@ -1,4 +1,4 @@
-"""Telemetry requests at the rate of the action loop, repeated whenever a stream slows down."""
+"""Telemetry requests at the policy's rate, repeated whenever a stream slows down."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator

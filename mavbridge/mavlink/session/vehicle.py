@@ -1,7 +1,7 @@
 """Session with one vehicle: its set-up, its state, and reasons why it cannot be flown.
 
 A state machine without I/O. The link steps it at every tick, so that connecting, reconnecting and a
-reboot of the vehicle are handled alike, and none of them blocks the action loop.
+reboot of the vehicle are handled alike, and none of them blocks the guard.
 """
 
 from collections.abc import Callable, Iterator
