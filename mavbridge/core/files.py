@@ -55,8 +55,6 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
 
 _NOT_REPLACED = (errno.EACCES, errno.EBUSY, errno.EPERM, errno.EROFS)
 """Errors on replacing a file that may be writable all the same."""
-
-
 _NO_FOLDER = (errno.EACCES, errno.EINVAL)
 """Errors of a folder that cannot be read, or on a file system that writes no folders to the disk
 (those that virtual machines share)."""

@@ -258,8 +258,7 @@ class _Flight:
         visions = [
             Worker(name, vision.run) for name, vision in zip(names, self._visions, strict=True)
         ]
-        policy_run = self._scheduled(self._policy.run, screen.show_message)
-        policy = Worker("mavbridge-policy", policy_run)
+        policy = Worker("mavbridge-policy", self._scheduled(self._policy.run, screen.show_message))
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
         listen = self._scheduled(partial(self._guard.listen, view=view))
         listener = Worker("mavbridge-guard", listen)
@@ -295,13 +294,12 @@ class _Flight:
     def _scheduled(
         self,
         run: Callable[[threading.Event], None],
-        report: Callable[[str], object] = lambda _refusal: None,
+        report: Callable[[str], object] = _log.debug,
     ) -> Callable[[threading.Event], None]:
         """Wrap a loop so that its thread sets its scheduling first."""
 
         def run_settled(stop: threading.Event) -> None:
-            refusal = settle_thread() if self._config.rates.realtime else None
-            if refusal is not None:
+            if self._config.rates.realtime and (refusal := settle_thread()) is not None:
                 report(refusal)
             run(stop)
 

@@ -41,8 +41,6 @@ OPEN_S = 20.0
 the machine may be busy."""
 CLOSE_S = 5.0
 """Longest wait for a guard that holds no sticks to end and free its port."""
-
-
 REAP_S = 0.2
 """Longest wait for a guard whose channel is closed to exit. Nothing is sent while it lives."""
 LATEST_NS = 500 * NS_PER_MS

@@ -20,7 +20,7 @@ from mavbridge.core.provenance import (
     versions,
     without_secrets,
 )
-from mavbridge.core.records import FlightOutcome, RateMode, TickSink
+from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.history import ActionFrame
@@ -109,7 +109,6 @@ class FlightObservers:
         self._plan = plan
         self._runner = runner
         self._clock = clock
-        self._mode: RateMode = "dual" if plan.is_dual else "single"
         action_hz, vision_hz = plan.loops.action_hz, plan.image_rates_hz[0]
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
@@ -207,7 +206,7 @@ class FlightObservers:
     ) -> None:
         viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(
-            mode=self._mode,
+            mode="dual" if self._plan.is_dual else "single",
             engine=self._runner.engine,
             policy=self._runner.name,
             autopilot=autopilot,

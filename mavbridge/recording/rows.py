@@ -14,15 +14,7 @@ import pyarrow as pa
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.rotation import Quaternion
-from mavbridge.core.vehicle import (
-    ACTION_CLASSES,
-    Action,
-    ActionKind,
-    ActionTrace,
-    AttitudeThrust,
-    BodyRates,
-    Sticks,
-)
+from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from mavbridge.recording.tables import Row, table_rows
 from policy.data.tables import (
     EXPERT_COLUMN,
@@ -151,7 +143,8 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action], *, readonly: boo
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
     # Body rates would keep a lean: outside the policy's flight the guard sends attitudes.
-    sent_as = AttitudeThrust if make is BodyRates and row["raw"] is None else make
+    is_attitude = make is ACTION_CLASSES["rates"] and row["raw"] is None
+    sent_as = ACTION_CLASSES["attitude"] if is_attitude else make
     values["sent"] = row["sent"] and sent_as(*row["sent"])
     values["rc_sticks"] = row["rc_sticks"] and Sticks(*row["rc_sticks"])
     if row["position_ned_m"] is not None:
