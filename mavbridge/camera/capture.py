@@ -109,7 +109,7 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
     name, source, options = without_secrets(url), url, LOW_LATENCY_OPTIONS
     if "://" not in url:
         source, options = library_name(Path(url)), options + SDP_OPTIONS
-    with _ffmpeg_options(options):
+    with _opening, _ffmpeg_options(options):
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, timeouts)
     if not capture.isOpened():
         raise CameraError(
@@ -130,14 +130,13 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
     of a stream joined between two key frames.
     """
     wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: "-8"}
-    with _opening:
-        added = {name: value for name, value in wanted.items() if name not in os.environ}
-        os.environ.update(added)
-        try:
-            yield
-        finally:
-            for name in added:
-                del os.environ[name]
+    added = {name: value for name, value in wanted.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
 
 
 def retrieve_rgb(capture: cv2.VideoCapture) -> CameraImage | None:

@@ -133,24 +133,21 @@ class ObserverThread:
     def _run(self, consumer: Consumer) -> None:
         try:
             with self._failing():
-                self._pass_events(consumer)
+                while not self._out_of_time.is_set():
+                    is_last_round = self._closing.wait(BATCH_PERIOD_S)
+                    batch = self._ticks.take(BATCH_EVENTS)
+                    for queue in (self._solves, *self._visions):
+                        batch += queue.take(BATCH_EVENTS)
+                    if batch:
+                        self._in_flight = len(batch)
+                        consumer.consume(batch)
+                        self._in_flight = 0
+                    elif is_last_round:
+                        return
         finally:
             self._open = False
             with self._failing():
                 consumer.close()
-
-    def _pass_events(self, consumer: Consumer) -> None:
-        while not self._out_of_time.is_set():
-            is_last_round = self._closing.wait(BATCH_PERIOD_S)
-            batch = self._ticks.take(BATCH_EVENTS)
-            for queue in (self._solves, *self._visions):
-                batch += queue.take(BATCH_EVENTS)
-            if batch:
-                self._in_flight = len(batch)
-                consumer.consume(batch)
-                self._in_flight = 0
-            elif is_last_round:
-                return
 
     @contextmanager
     def _failing(self) -> Iterator[None]:

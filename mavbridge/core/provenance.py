@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -60,10 +61,8 @@ def versions() -> dict[str, str]:
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
     }
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
@@ -93,9 +92,6 @@ def digests(files: Iterable[Path]) -> dict[str, str]:
     """Return the SHA-256 of each file by its absolute path; unreadable files are left out."""
     found = {}
     for path in files:
-        try:
-            with path.open("rb") as file:
-                found[str(path.resolve())] = hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError:
-            continue
+        with suppress(OSError), path.open("rb") as file:
+            found[str(path.resolve())] = hashlib.file_digest(file, "sha256").hexdigest()
     return found

@@ -248,8 +248,7 @@ class GuardProcess:
         return True
 
     def close(self) -> None:
-        """Close the channel. A running guard takes this for our death, and ends by itself, once it
-        holds no sticks."""
+        """Close the channel. A running guard takes this for our death, and ends when it may."""
         self._port.close()
         self.samples.close()
         newest = self._newest if self.summary is None else None

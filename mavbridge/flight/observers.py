@@ -13,13 +13,7 @@ from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import as_json, write_output
 from mavbridge.core.observers import ObserverThread
-from mavbridge.core.provenance import (
-    command_line,
-    digests,
-    git_revision,
-    versions,
-    without_secrets,
-)
+from mavbridge.core.provenance import command_line, digests, git_revision, versions, without_secrets
 from mavbridge.core.records import FlightOutcome, TickSink
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.guard_process import GuardProcess

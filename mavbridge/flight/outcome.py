@@ -198,9 +198,10 @@ def flight_verdict(
         crash: how the vehicle hit something since the policy's first action, in words.
         record: folder of the recording, if there is one.
     """
-    interrupted = None if stop.signal_number is None else 128 + stop.signal_number
+    signal_number = stop.signal_number
+    not_flown = ExitCode.NOT_FLOWN if signal_number is None else 128 + signal_number
     if summary is None:
-        return interrupted or ExitCode.NOT_FLOWN, None
+        return not_flown, None
     outcome = summary.outcome
     if outcome.fault is not None:
         shown = f"; see it with: mavbridge inspect {shlex.quote(str(record))}" if record else ""
@@ -212,10 +213,9 @@ def flight_verdict(
         return ExitCode.DONE, None
     if not outcome.flights:
         why = f": {reason}" if reason else ""
-        return interrupted or ExitCode.NOT_FLOWN, f"the policy has not flown{why}"
+        return not_flown, f"the policy has not flown{why}"
     if outcome.has_left_ground is False:
-        code = interrupted or ExitCode.NOT_FLOWN
-        return code, "the vehicle has not left the ground"
+        return not_flown, "the vehicle has not left the ground"
     if outcome.end == "disarmed":
         text = "the vehicle was disarmed, or restarted, while the policy flew it"
         return ExitCode.NOT_FLOWN, text

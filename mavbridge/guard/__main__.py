@@ -21,12 +21,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, GuardSettings, Outcome
-from mavbridge.guard.wire import (
-    GuardDiedError,
-    GuardSummary,
-    encode,
-    read_settings,
-)
+from mavbridge.guard.wire import GuardDiedError, GuardSummary, encode, read_settings
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.signing_files import SigningStore
