@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Event, Tick
-from mavbridge.core.switch import Position, Switch
+from mavbridge.core.switch import Switch, SwitchPosition
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.observers import flight_meta
 from mavbridge.flight.plan import FlightPlan
@@ -50,7 +50,7 @@ class EpisodeControl:
         self._readings: deque[tuple[int, int]] = deque(maxlen=MAX_READINGS)
         """Stamp and pulse width of each reading since the last step."""
         self._switch = Switch(rests=("low", "middle"))
-        self._position: Position | None = None
+        self._position: SwitchPosition | None = None
         """Last known position, kept through readings without one."""
         self._middle_since_ns: int | None = None
         """Time at which the switch moved from high to the middle after an episode."""

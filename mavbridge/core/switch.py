@@ -14,7 +14,7 @@ DWELL_NS = 200 * NS_PER_MS
 GAP_NS = 500 * NS_PER_MS
 """Longest gap between two readings: ten periods of 20 Hz, the slowest requested rate."""
 
-Position: TypeAlias = Literal["low", "middle", "high"]
+SwitchPosition: TypeAlias = Literal["low", "middle", "high"]
 
 
 class Switch:
@@ -24,7 +24,9 @@ class Switch:
     its channels as a hand would.
     """
 
-    def __init__(self, *, rest_ns: int = DWELL_NS, rests: tuple[Position, ...] = ("low",)) -> None:
+    def __init__(
+        self, *, rest_ns: int = DWELL_NS, rests: tuple[SwitchPosition, ...] = ("low",)
+    ) -> None:
         """``rest_ns``: least time in a position of ``rests`` before going high counts again.
 
         The debounce time is enough the first time, when no dropout can have happened.
@@ -35,7 +37,7 @@ class Switch:
         self._since_ns = 0
         self.newest_ns: int | None = None
         """Arrival of the newest reading; None before the first."""
-        self.position: Position | None = None
+        self.position: SwitchPosition | None = None
         """Position of the newest reading; None before the first, and after the receiver was
         lost."""
         self.is_off = False
@@ -50,7 +52,7 @@ class Switch:
         before = self.position
         if is_late := self.newest_ns is not None and arrived_ns - self.newest_ns > GAP_NS:
             self.forget()
-        position: Position = (
+        position: SwitchPosition = (
             "high" if value_us > ON_US else "low" if value_us < OFF_US else "middle"
         )
         if position != self.position:

@@ -372,8 +372,8 @@ class LinkStats:
     lost_fraction: float | None
     rtt_ms: Percentiles | None
     """Round trips of our TIMESYNC requests."""
-    sent_overrides: int
-    """Stick messages handed to the kernel, releases not counted."""
+    sent_actions: int
+    """Sticks and setpoints handed to the kernel, releases not counted."""
     echo_confirmed: bool | None
     """The vehicle showed our sticks in RC_CHANNELS; None: no stick was sent."""
     unusable_packets: int = 0

@@ -13,7 +13,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.values import EndRequest, Outcome, Phase
+from mavbridge.guard.values import EndRequest, GuardOutcome, Phase
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 from mavbridge.recording.crash import CrashWatch
 
@@ -118,7 +118,7 @@ class FlightReferee:
         return EndRequest(because(Code.COURSE_DONE), "course") if is_over else None
 
     def outcome(
-        self, asked: EndRequest, vehicle: GuardStatus, told: Outcome | None
+        self, asked: EndRequest, vehicle: GuardStatus, told: GuardOutcome | None
     ) -> FlightOutcome | None:
         """Return the outcome of the flight; None if the policy has not flown.
 

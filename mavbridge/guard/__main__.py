@@ -20,7 +20,7 @@ from mavbridge.core.realtime import settle_guard
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.loop import GuardLoop
-from mavbridge.guard.values import EndRequest, GuardSettings, Outcome
+from mavbridge.guard.values import EndRequest, GuardOutcome, GuardSettings
 from mavbridge.guard.wire import GuardDiedError, GuardSummary, encode, read_settings
 from mavbridge.mavlink.codec.tlog import PacketPipe
 from mavbridge.mavlink.link import MavlinkLink
@@ -91,7 +91,7 @@ def _run(settings: GuardSettings, port: SocketPort, samples: SocketPort, stack: 
         link.close()
     summary = GuardSummary(
         link=link.stats(),
-        outcome=loop.guard.engagement.outcome if loop.guard else Outcome(),
+        outcome=loop.guard.engagement.outcome if loop.guard else GuardOutcome(),
         params=dict(link.known_params),
         dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,

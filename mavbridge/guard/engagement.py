@@ -22,10 +22,10 @@ from mavbridge.guard.table import (
     switch_unseen,
 )
 from mavbridge.guard.values import (
-    Actions,
     ControlSource,
     EndRequest,
     EngagementInputs,
+    EngagementOutput,
     EngagementSettings,
     OperatorCommand,
     Phase,
@@ -63,7 +63,7 @@ class Engagement(Memory):
         if self.end_request is None or self.end_request.reason is self.outcome.failure:
             self.end_request, self.must_stop = request, True
 
-    def step(self, now: EngagementInputs, act: OperatorCommand | None) -> Actions:
+    def step(self, now: EngagementInputs, act: OperatorCommand | None) -> EngagementOutput:
         """Advance to ``now`` with the operator's command, if any; return the actions to take."""
         if self.settings.readonly:
             return self._watch(now)
@@ -98,13 +98,13 @@ class Engagement(Memory):
                 return row.next
         return None
 
-    def _control(self, now: EngagementInputs) -> Actions:
+    def _control(self, now: EngagementInputs) -> EngagementOutput:
         """Return the actions of the current state."""
         match self.phase:
             case Phase.PREPARING:
                 return self._prepare(now)
             case Phase.FLYING:
-                return Actions(control=ControlSource.POLICY)
+                return EngagementOutput(control=ControlSource.POLICY)
             case Phase.LEAVING | Phase.HOLDING:
                 if now.status.mode == self.disengage.mode or self.has_asked(now):
                     self.own_mode = now.status.mode
@@ -115,13 +115,13 @@ class Engagement(Memory):
                 mode = self.lost_mode(now) if is_due else None
                 if mode is not None:
                     self.disengage.request_due_ns = now.now_ns + MODE_SPACING_NS
-                return Actions(control=ControlSource.RELEASE, mode=mode)
+                return EngagementOutput(control=ControlSource.RELEASE, mode=mode)
             case Phase.WAITING:
                 problem = now.link.problem or now.chunk_problem or switch_unseen(self, now)
                 self.reason = problem or because(Code.NOT_ENGAGED)
-        return Actions()
+        return EngagementOutput()
 
-    def _prepare(self, now: EngagementInputs) -> Actions:
+    def _prepare(self, now: EngagementInputs) -> EngagementOutput:
         self.was_armed = now.status.armed
         # During the policy's reset, its silence must not restart the reset.
         chunk_problem = now.chunk_problem if self.starting_ns is None else None
@@ -140,14 +140,14 @@ class Engagement(Memory):
                 self.until_ns = max(self.until_ns, now.now_ns + self.first_chunk_ns)
             self.is_extended = True
 
-    def _watch(self, now: EngagementInputs) -> Actions:
+    def _watch(self, now: EngagementInputs) -> EngagementOutput:
         """Read-only: run the policy whenever it could fly; the link sends nothing."""
         if (cause := self.end_request or duration_over(self, now)) is not None:
             if self.outcome.flights:
                 self.phase = Phase.FLYING  # also if the policy could not fly at the end
             self._note_end(cause)
             self.phase, self.reason = Phase.ENDED, cause.reason
-            return Actions()
+            return EngagementOutput()
         problem = objection(self, now)
         if self.starting_ns is None:
             problem = problem or now.chunk_problem
@@ -156,10 +156,10 @@ class Engagement(Memory):
         if self.phase is not Phase.FLYING:
             self._start(now, is_ready=problem is None)
             if self.starting_ns is None or not now.is_policy_reset or now.chunk_problem is not None:
-                return Actions()
+                return EngagementOutput()
             self.fly(now, None)
             self.phase, self.starting_ns = Phase.FLYING, None
-        return Actions(control=ControlSource.POLICY)
+        return EngagementOutput(control=ControlSource.POLICY)
 
     # --- inputs noted before the table is read
 
@@ -233,7 +233,7 @@ class Engagement(Memory):
 
     # --- last words
 
-    def rehearse(self, now: EngagementInputs) -> Iterator[tuple[int, Actions]]:
+    def rehearse(self, now: EngagementInputs) -> Iterator[tuple[int, EngagementOutput]]:
         """Yield the actions that end the flight if the guard dies now, with their delays [ns].
 
         A copy of this state machine treats the death as a fault; it hears nothing of the vehicle.
@@ -260,4 +260,4 @@ class Engagement(Memory):
         must_release = twin.phase is Phase.LEAVING and not twin.disengage.is_silence_failsafe
         if twin.phase is Phase.RELEASING or must_release:
             for k in range(_RELEASES):
-                yield until_ns + k * 50 * NS_PER_MS, Actions(control=ControlSource.RELEASE)
+                yield until_ns + k * 50 * NS_PER_MS, EngagementOutput(control=ControlSource.RELEASE)

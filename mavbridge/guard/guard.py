@@ -25,10 +25,10 @@ from mavbridge.guard.envelope import Envelope
 from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
 from mavbridge.guard.table import switch_unseen
 from mavbridge.guard.values import (
-    Actions,
     ControlSource,
     EndRequest,
     EngagementInputs,
+    EngagementOutput,
     FlightSettings,
     OperatorCommand,
     Phase,
@@ -61,7 +61,7 @@ class GuardOutput:
 
     decision: Decision | None
     """None: send nothing now."""
-    actions: Actions
+    actions: EngagementOutput
     """Requests to the vehicle."""
     messages: tuple[str, ...]
     """Texts for the user."""

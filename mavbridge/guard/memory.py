@@ -13,8 +13,8 @@ from mavbridge.guard.values import (
     EndRequest,
     EngagementInputs,
     EngagementSettings,
+    GuardOutcome,
     OperatorCommand,
-    Outcome,
     Phase,
 )
 
@@ -43,7 +43,7 @@ class Memory:
     """Why the policy does not fly; None while it does."""
     refusal: Reason | None = None
     """Failure of the last act, or missing confirmation by the vehicle; the reader resets it."""
-    outcome: Outcome = field(default_factory=Outcome)
+    outcome: GuardOutcome = field(default_factory=GuardOutcome)
     act: OperatorCommand | None = None
     """Act of this step, from any source, until a row handles it."""
     end_request: EndRequest | None = None

@@ -7,9 +7,9 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import GAP_NS
 from mavbridge.core.vehicle import OnFault
 from mavbridge.guard.values import (
-    Actions,
     ControlSource,
     EngagementInputs,
+    EngagementOutput,
     EngagementSettings,
 )
 
@@ -116,7 +116,7 @@ class EngageSequence:
             return now.command_fault or now.slowness
         return because(Code.NO_SUCH_MODE, mode=wanted, modes=", ".join(names))
 
-    def step(self, now: EngagementInputs, objection: Reason | None) -> Actions:
+    def step(self, now: EngagementInputs, objection: Reason | None) -> EngagementOutput:
         """Advance; with an ``objection``, keep the sticks going but request nothing."""
         self._watch_climb(now)
         wanted = self.wanted_mode(now)
@@ -128,18 +128,18 @@ class EngageSequence:
         is_heard = now.status.armed or now.link.echo_confirmed
         is_due = is_heard and now.now_ns >= self.request_due_ns
         if self.waits_for is None or objection is not None or not is_due:
-            return Actions(control=control)
+            return EngagementOutput(control=control)
         if control is ControlSource.NEUTRAL and (self.settings.is_setpoint or self.lends_sticks):
             if self.flows_from_ns is None:
                 self.flows_from_ns = now.now_ns
             if now.now_ns - self.flows_from_ns < FLOW_NS:
-                return Actions(control=control)
+                return EngagementOutput(control=control)
         if climb_m is not None and now.status.is_landed is False:
-            return Actions(control=control)
+            return EngagementOutput(control=control)
         self.request_due_ns = now.now_ns + REQUEST_SPACING_NS
         self.asked_mode = wanted
         arm = wanted is None and not now.status.armed
-        return Actions(control=control, mode=wanted, arm=arm, takeoff_m=climb_m)
+        return EngagementOutput(control=control, mode=wanted, arm=arm, takeoff_m=climb_m)
 
     def _lend_sticks(self, now: EngagementInputs, wanted: str | None) -> None:
         """Start neutral sticks if PX4 has refused a mode that it enters only with sticks.
@@ -334,7 +334,7 @@ class DisengageSequence:
         blind_ns = FAILSAFE_BLIND_NS if has_failsafe else BLIND_NS
         return unheard_ns is None or now.now_ns - unheard_ns <= blind_ns
 
-    def step(self, now: EngagementInputs, unheard_ns: int | None) -> Actions:
+    def step(self, now: EngagementInputs, unheard_ns: int | None) -> EngagementOutput:
         """Send neutral, and request the mode until it is confirmed or refused.
 
         ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: known.
@@ -372,11 +372,11 @@ class DisengageSequence:
             control = None
         is_due = now.now_ns >= self.request_due_ns and self._may_ask(now, unheard_ns)
         if is_confirmed or not is_due:
-            return Actions(control=control)
+            return EngagementOutput(control=control)
         if (is_undone and not self._is_told(now)) or not self._are_at_rest(now):
-            return Actions(control=control)
+            return EngagementOutput(control=control)
         if not is_undone:
             self.asked_ns = self.entered_ns = now.now_ns
         is_slow = is_late and now.link.problem is None  # each refusal prints a reason
         self.request_due_ns = now.now_ns + (SLOW_SPACING_NS if is_slow else MODE_SPACING_NS)
-        return Actions(control=control, mode=self.mode)
+        return EngagementOutput(control=control, mode=self.mode)

@@ -66,7 +66,7 @@ class EndRequest(NamedTuple):
         return self.end not in ("takeover", "disarmed", "fault")
 
 
-class Outcome(NamedTuple):
+class GuardOutcome(NamedTuple):
     """Outcome of one guard's flights so far, for the exit status and the report."""
 
     flights: int = 0
@@ -115,8 +115,8 @@ class EngagementSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Actions:
-    """Actions of the guard at one moment."""
+class EngagementOutput:
+    """What the engagement wants of the guard now."""
 
     control: ControlSource | None = None
     """None: send nothing."""

@@ -31,9 +31,9 @@ from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import (
     EndRequest,
     FlightSettings,
+    GuardOutcome,
     GuardSettings,
     OperatorCommand,
-    Outcome,
     Phase,
 )
 
@@ -105,7 +105,7 @@ class GuardSummary:
     """Last message of a guard that ends normally."""
 
     link: LinkStats
-    outcome: Outcome
+    outcome: GuardOutcome
     params: dict[str, float]
     """The vehicle's flight-relevant parameters that have been read, by name."""
     dropped_messages: int

@@ -49,7 +49,7 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import REFUSED_NS, Address, Connection, Transport
 
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
-"""Two usual stick periods: a due request leaves before a stick message, never after it."""
+"""Two usual stick periods: a due request leaves before an action, never after it."""
 _HEARTBEAT_HZ = 1.0
 
 
@@ -242,7 +242,7 @@ class MavlinkLink:
             messages_per_s=counters.messages_per_s,
             lost_fraction=counters.lost_fraction,
             rtt_ms=timesync.round_trips.percentiles_ms(),
-            sent_overrides=sent,
+            sent_actions=sent,
             echo_confirmed=output.was_confirmed if sent and output is not None else None,
             unusable_packets=self._codec.bad_data_count,
             refused_signatures=self._codec.refused_signatures,

@@ -337,7 +337,7 @@ def _link_text(link: LinkStats) -> str:
         if link.lost_fraction is None
         else f"{shown_share(link.lost_fraction, 2)} of the vehicle's messages lost"
     )
-    sent = f"{_counted(link.sent_overrides, 'stick message')} sent"
+    sent = f"{_counted(link.sent_actions, 'command')} sent"
     return f"{sent}, {echo[link.echo_confirmed]}, {lost}"
 
 

@@ -21,9 +21,9 @@ from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import ActionLimits, Smoothing
 from mavbridge.guard.values import (
-    Actions,
     EndRequest,
     EngagementInputs,
+    EngagementOutput,
     EngagementSettings,
     FlightSettings,
     OperatorCommand,
@@ -187,11 +187,11 @@ class Stepped:
     def __init__(self, facts: EngagementInputs = AIRBORNE, **settings: Any) -> None:
         self.engagement = Engagement(engagement_settings(**settings))
         self.facts = facts
-        self.moves: list[Actions] = []
+        self.moves: list[EngagementOutput] = []
 
     def step(
         self, act: OperatorCommand | None = None, *, stop: EndRequest | None = None, **changes: Any
-    ) -> Actions:
+    ) -> EngagementOutput:
         """Step once, 10 ms after the last; changes of the facts persist."""
         if stop is not None:
             self.engagement.stop(stop)
@@ -201,7 +201,7 @@ class Stepped:
         self.moves.append(self.engagement.step(self.facts, act))
         return self.moves[-1]
 
-    def run(self, seconds: float, **changes: Any) -> list[Actions]:
+    def run(self, seconds: float, **changes: Any) -> list[EngagementOutput]:
         """Step for a while; return the decisions."""
         start = len(self.moves)
         for _ in range(round(seconds * 100)):

@@ -49,7 +49,7 @@ def test_a_flight_holds_its_altitude_gives_the_sticks_back_and_is_reported_and_r
     assert set(overrides[first:]) == {RELEASE}
     assert vehicle["releases"] >= 1
     assert (report["mode"], report["link"]["echo_confirmed"]) == ("dual", True)
-    assert report["link"]["sent_overrides"] >= vehicle["overrides"] > 0
+    assert report["link"]["sent_actions"] >= vehicle["overrides"] > 0
     assert report["observer_drops"]["recorder"] == 0
 
     assert str(folder) in "\n".join(output.splitlines()[-2:])

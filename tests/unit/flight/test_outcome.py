@@ -23,10 +23,10 @@ from mavbridge.flight.outcome import (
     describe,
     flight_verdict,
 )
-from mavbridge.guard.values import EndRequest, Outcome
+from mavbridge.guard.values import EndRequest, GuardOutcome
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 
-FLOWN = Outcome(flights=1, has_left_ground=True)
+FLOWN = GuardOutcome(flights=1, has_left_ground=True)
 NO_CHUNK = because(Code.NO_CHUNK)
 FAULT = because(Code.POLICY_FAILED)
 HIT = "it hit gate 7"
@@ -34,13 +34,13 @@ STATS = LinkStats(
     messages_per_s={},
     lost_fraction=None,
     rtt_ms=None,
-    sent_overrides=0,
+    sent_actions=0,
     echo_confirmed=None,
     vehicle_clock_offset_ns=None,
 )
 
 
-def summary(outcome: Outcome) -> GuardSummary:
+def summary(outcome: GuardOutcome) -> GuardSummary:
     return GuardSummary(
         link=STATS,
         outcome=outcome,
@@ -67,8 +67,8 @@ def stopped(number: int | None) -> StopRequest:
         (FLOWN._replace(end="disarmed"), None, None, 3, "was disarmed"),
         (FLOWN._replace(has_left_ground=False), None, None, 3, "not left the ground"),
         (FLOWN._replace(has_left_ground=False), signal.SIGTERM, None, 143, "not left the ground"),
-        (Outcome(), None, None, 3, f"the policy has not flown: {NO_CHUNK}"),
-        (Outcome(), signal.SIGINT, None, 130, "the policy has not flown"),
+        (GuardOutcome(), None, None, 3, f"the policy has not flown: {NO_CHUNK}"),
+        (GuardOutcome(), signal.SIGINT, None, 130, "the policy has not flown"),
         (None, signal.SIGINT, None, 130, None),  # an impatient user, while the guard holds neutral
         (None, None, None, 3, None),
         (FLOWN, None, HIT, 6, HIT),
@@ -79,7 +79,11 @@ def stopped(number: int | None) -> StopRequest:
     ],
 )
 def test_the_status_says_what_a_script_needs(
-    outcome: Outcome | None, number: int | None, crash: str | None, status: int, told: str | None
+    outcome: GuardOutcome | None,
+    number: int | None,
+    crash: str | None,
+    status: int,
+    told: str | None,
 ) -> None:
     words = None if outcome is None else summary(outcome)
     exit_code, text = flight_verdict(
@@ -100,9 +104,9 @@ def test_a_fault_is_told_with_its_cause_and_the_command_that_shows_it(record: Pa
 
 
 def test_a_flight_that_sends_nothing_needs_no_air() -> None:
-    watched = summary(Outcome(flights=1, has_left_ground=False))
+    watched = summary(GuardOutcome(flights=1, has_left_ground=False))
     assert flight_verdict(watched, stopped(None), reason=None, readonly=True)[0] == 0
-    unseen = summary(Outcome())
+    unseen = summary(GuardOutcome())
     assert flight_verdict(unseen, stopped(None), reason=None, readonly=True)[0] == 3
 
 
@@ -132,7 +136,7 @@ def judged(
     referee = FlightReferee(gates)
     for tick in ticks:
         referee.emit(tick)
-    outcome = referee.outcome(EndRequest(FAULT, end), HOVERING, Outcome(end=end, fault=FAULT))
+    outcome = referee.outcome(EndRequest(FAULT, end), HOVERING, GuardOutcome(end=end, fault=FAULT))
     assert outcome is not None
     return outcome
 
@@ -143,7 +147,7 @@ def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     assert over[0] == 80 + RUN_OUT_NS // 10_000_000
     ending = referee.ending(ticks[-1].sent_ns)
     assert ending == EndRequest(because(Code.COURSE_DONE), "course")
-    outcome = referee.outcome(ending, HOVERING, Outcome(end="course"))
+    outcome = referee.outcome(ending, HOVERING, GuardOutcome(end="course"))
     assert outcome is not None
     assert (outcome.gates_passed, outcome.gates_total, outcome.success) == (2, 2, True)
     assert outcome.course_s == pytest.approx(0.8)
@@ -218,7 +222,7 @@ def test_an_end_of_which_no_tick_came_through_is_told_by_the_summary(
     referee, asked = FlightReferee(None), EndRequest(because(Code.SIGNAL))
     for tick in course_ticks(50):
         referee.emit(tick)
-    outcome = referee.outcome(asked, HOVERING, Outcome(flights=1, end=end, fault=FAULT))
+    outcome = referee.outcome(asked, HOVERING, GuardOutcome(flights=1, end=end, fault=FAULT))
     assert outcome is not None
     assert (outcome.end, outcome.reason) == (end, reason)
 

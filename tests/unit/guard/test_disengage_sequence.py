@@ -23,7 +23,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.core.vehicle import FlightEnd, ModeRoles
 from mavbridge.guard.sequences import DisengageSequence
-from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
+from mavbridge.guard.values import ControlSource, EndRequest, EngagementOutput, Phase
 
 IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
 MIDDLE = altered(AIRBORNE, pilot_sticks=CENTRED)
@@ -105,7 +105,7 @@ def at_fault(facts: Any, **rules: Any) -> Stepped:
 def test_the_mode_of_the_way_out(facts: Any, rules: Any, mode: str | None) -> None:
     stepped = flying(facts, **rules)
     move = stepped.step("release") if "then" in rules else stepped.step(**FAULT)
-    assert move == Actions(control=NEUTRAL, mode=mode)
+    assert move == EngagementOutput(control=NEUTRAL, mode=mode)
     assert mode is not None or stepped.engagement.refusal is None
 
 
@@ -121,7 +121,7 @@ def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest
     moves = [stepped.step(**FAULT)]  # at rest, but neutral has not left yet
     moves += [stepped.step(**FAULT, are_sticks_at_rest=False) for _ in range(40)]
     assert {(move.control, move.mode) for move in moves} == {(NEUTRAL, None)}
-    assert stepped.step(are_sticks_at_rest=True) == Actions(control=NEUTRAL, mode=mode)
+    assert stepped.step(are_sticks_at_rest=True) == EngagementOutput(control=NEUTRAL, mode=mode)
 
 
 def held_by_px4(seconds: float = 0.01) -> Stepped:
@@ -133,7 +133,9 @@ def held_by_px4(seconds: float = 0.01) -> Stepped:
     return stepped
 
 
-def left_for_a_hand(stepped: Stepped, told_ns: int | None, **changes: Any) -> list[Actions]:
+def left_for_a_hand(
+    stepped: Stepped, told_ns: int | None, **changes: Any
+) -> list[EngagementOutput]:
     """AUTO.LOITER becomes POSCTL, and perhaps an EVENT tells of sticks; 0.2 s from there on."""
     changes |= {"mode": "POSCTL", "stick_override_ns": told_ns}
     return [stepped.step(**changes) for _ in range(20)]
@@ -366,7 +368,7 @@ def test_px4s_failsafe_for_want_of_sticks_is_undone_ten_times_a_second_for_1_5_s
     moves = stepped.run(2.0, **DROPPED)
     assert [k for k, move in enumerate(moves) if move.mode == "ALTCTL"] == [*range(0, 150, 10)]
     assert (stepped.phase, stepped.engagement.refusal) == (Phase.RELEASED, None)
-    assert stepped.step(mode="ALTCTL") == Actions()
+    assert stepped.step(mode="ALTCTL") == EngagementOutput()
     assert stepped.engagement.refusal is None, "it is the mode of the release"
 
 
@@ -400,19 +402,19 @@ def test_no_failsafe_is_undone_after_a_takeover(taken: Any) -> None:
 # --- a vehicle that is not heard, and our own standstill
 
 
-def silence(stepped: Any, seconds: float) -> list[Actions]:
+def silence(stepped: Any, seconds: float) -> list[EngagementOutput]:
     """No packet of the vehicle for a while."""
     now_ns = stepped.facts.now_ns
-    moves: list[Actions] = stepped.run(seconds, heard_ns=now_ns, mode_arrived_ns=now_ns)
+    moves: list[EngagementOutput] = stepped.run(seconds, heard_ns=now_ns, mode_arrived_ns=now_ns)
     return moves
 
 
-def standstill(stepped: Any, seconds: float, **changes: Any) -> Actions:
+def standstill(stepped: Any, seconds: float, **changes: Any) -> EngagementOutput:
     """The guard does not run for a while; the first step after it."""
     facts = stepped.facts
     now_ns = facts.now_ns + round(seconds * 1e9)
     stepped.facts = altered(facts, now_ns=now_ns)
-    move: Actions = stepped.step(mode_arrived_ns=now_ns - 1_000_000, **changes)
+    move: EngagementOutput = stepped.step(mode_arrived_ns=now_ns - 1_000_000, **changes)
     return move
 
 
@@ -456,7 +458,9 @@ def test_the_time_for_which_a_mode_is_asked_for_unheard_includes_its_end(
 ) -> None:
     settings = engagement_settings()
     sequence = DisengageSequence(settings, mode="BRAKE", is_silence_failsafe=is_failsafe)
-    assert sequence.step(altered(AIRBORNE, now_ns=blind_ns + 2), 1) == Actions(control=NEUTRAL)
+    assert sequence.step(altered(AIRBORNE, now_ns=blind_ns + 2), 1) == EngagementOutput(
+        control=NEUTRAL
+    )
     assert sequence.step(altered(AIRBORNE, now_ns=blind_ns + 1), 1).mode == "BRAKE"
 
 
@@ -473,7 +477,7 @@ def test_a_failsafe_of_its_own_is_its_way_out_after_a_silence(
     else:
         standstill(stepped, 4)
     news = {"heard_ns": None, "mode_arrived_ns": None, "mode": own, "is_failsafe": True}
-    assert stepped.step(**news) == Actions(control=RELEASE)
+    assert stepped.step(**news) == EngagementOutput(control=RELEASE)
     assert {move.mode for move in stepped.run(5)} == {None}
 
 
@@ -567,7 +571,7 @@ def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_
     assert {move.control for move in unheard} == {None}
     assert sum(move.mode == "AUTO.LOITER" for move in unheard) == 24
     failed = stepped.step(mode="AUTO.RTL", is_failsafe=True)
-    assert failed == Actions(control=RELEASE)
+    assert failed == EngagementOutput(control=RELEASE)
 
 
 GUIDED = altered(AIRBORNE, mode="GUIDED")

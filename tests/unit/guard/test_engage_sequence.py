@@ -10,9 +10,9 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.sequences import FLOW_NS, EngageSequence
 from mavbridge.guard.values import (
-    Actions,
     ControlSource,
     EngagementInputs,
+    EngagementOutput,
     EngagementSettings,
     Phase,
 )
@@ -23,7 +23,7 @@ NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
 PX4_GROUND = altered(GROUND, mode="AUTO.LOITER", modes=PX4_MODES)
 
 
-def requests(moves: list[Actions]) -> list[str]:
+def requests(moves: list[EngagementOutput]) -> list[str]:
     """Everything that was asked for, in order."""
     asked: list[str] = []
     for move in moves:
@@ -211,16 +211,16 @@ def test_the_setpoints_of_a_second_way_in_flow_as_long_as_those_of_the_first() -
 def test_a_vehicle_without_sticks_that_refuses_the_mode_is_lent_ours_for_this_way_in() -> None:
     facts = altered(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES, has_receiver=False)
     sequence = begun(facts, modes=("ALTCTL",))
-    assert sequence.step(facts, None) == Actions(mode="ALTCTL")
+    assert sequence.step(facts, None) == EngagementOutput(mode="ALTCTL")
     refused = altered(facts, now_ns=1, refused_mode="ALTCTL")
-    assert sequence.step(refused, None) == Actions(control=NEUTRAL)
+    assert sequence.step(refused, None) == EngagementOutput(control=NEUTRAL)
     assert sequence.has_sticks
     flowed = altered(refused, now_ns=1 + FLOW_NS)
-    assert sequence.step(flowed, None) == Actions(control=NEUTRAL, mode="ALTCTL")
+    assert sequence.step(flowed, None) == EngagementOutput(control=NEUTRAL, mode="ALTCTL")
     unheard = because(Code.HEARTBEAT_LOST)
     for problem in (None, unheard):  # the end of sticks would be a failsafe
         later = altered(flowed, now_ns=2 + FLOW_NS, problem=problem)
-        assert sequence.step(later, None) == Actions(control=NEUTRAL)
+        assert sequence.step(later, None) == EngagementOutput(control=NEUTRAL)
     sequence.begin(facts)
     assert not sequence.has_sticks
 

@@ -22,10 +22,10 @@ from helpers.guard_facts import (
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.engagement import Engagement
-from mavbridge.guard.values import Actions, ControlSource, EndRequest, Outcome, Phase
+from mavbridge.guard.values import ControlSource, EndRequest, EngagementOutput, GuardOutcome, Phase
 
-NOTHING, FLIES = Actions(), Actions(control=ControlSource.POLICY)
-RELEASE = Actions(control=ControlSource.RELEASE)
+NOTHING, FLIES = EngagementOutput(), EngagementOutput(control=ControlSource.POLICY)
+RELEASE = EngagementOutput(control=ControlSource.RELEASE)
 UNSEEN = because(Code.ARMED_UNSEEN)
 
 
@@ -224,19 +224,19 @@ def test_a_vehicle_that_was_not_ready_is_told_as_it_was() -> None:
         is_echoed=False,
         inputs=because(Code.NO_IMAGE),
     )
-    assert stepped.engagement.outcome == Outcome(failure=failure), "the policy never flew"
+    assert stepped.engagement.outcome == GuardOutcome(failure=failure), "the policy never flew"
 
 
 def test_each_flight_and_how_it_ended_is_counted() -> None:
     stepped = flying(altered(AIRBORNE, is_landed=None))
     stepped.step()
-    assert stepped.engagement.outcome == Outcome(flights=1)
+    assert stepped.engagement.outcome == GuardOutcome(flights=1)
     stepped.step(is_landed=True)
     assert stepped.engagement.outcome.has_left_ground is False
     stepped.step(is_landed=False)
     stepped.step(is_landed=True)
     stepped.step(**FAULT)
-    fault = Outcome(1, has_left_ground=True, end="fault", fault=FAULT["chunk_fault"])
+    fault = GuardOutcome(1, has_left_ground=True, end="fault", fault=FAULT["chunk_fault"])
     assert stepped.engagement.outcome == fault
     stepped.run(0.2, chunk_fault=None, is_released=True)
     stepped.step("engage")
@@ -329,12 +329,12 @@ def test_watching_that_never_flew_ends_no_flight() -> None:
     stepped = Stepped(altered(AIRBORNE, chunk_problem=because(Code.NO_IMAGE)), readonly=True)
     stepped.step()
     assert stepped.step(stop=DEATH) == NOTHING
-    assert (stepped.phase, stepped.engagement.outcome) == (Phase.ENDED, Outcome())
+    assert (stepped.phase, stepped.engagement.outcome) == (Phase.ENDED, GuardOutcome())
 
 
 @pytest.mark.parametrize("ends", ["stop", "duration"])
 @pytest.mark.parametrize("at_last", [FLIES, NOTHING])
-def test_watching_ends_as_a_flight_does(ends: str, at_last: Actions) -> None:
+def test_watching_ends_as_a_flight_does(ends: str, at_last: EngagementOutput) -> None:
     stepped = Stepped(readonly=True, duration_ns=NS_PER_S if ends == "duration" else None)
     assert set(stepped.run(0.9)) == {FLIES}
     late = None if at_last == FLIES else because(Code.NO_IMAGE)

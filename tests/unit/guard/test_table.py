@@ -25,7 +25,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard import engagement
 from mavbridge.guard.memory import not_engaged
 from mavbridge.guard.table import PROGRESS, TABLE, Transition
-from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
+from mavbridge.guard.values import ControlSource, EndRequest, EngagementOutput, Phase
 
 IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
 WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
@@ -526,7 +526,7 @@ CASES = {
 # fmt: on
 
 
-def take(case: Case) -> tuple[Stepped, Actions]:
+def take(case: Case) -> tuple[Stepped, EngagementOutput]:
     stepped = case.start()
     stepped.engagement.refusal = None
     before, actions = stepped.phase, stepped.step(**case.changes)

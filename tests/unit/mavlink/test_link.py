@@ -256,7 +256,7 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
     assert rig.overrides()[count:] == [RELEASE_US]  # the last one was before an override
     rig.run(6.0, PILOTS)
     assert rig.overrides()[count:] == [RELEASE_US] * 80
-    assert rig.link.stats().sent_overrides == 41
+    assert rig.link.stats().sent_actions == 41
 
 
 @pytest.mark.parametrize(("dropped", "is_refused"), [(1, True), (2, True), (1, False)])
@@ -290,7 +290,7 @@ def test_the_report_tells_of_echo_and_clocks() -> None:
     assert told.echo_confirmed is None  # nothing was sent
     rig.run(0.8, IDLE)
     told = rig.link.stats()
-    assert (told.sent_overrides, told.echo_confirmed) == (80, True)
+    assert (told.sent_actions, told.echo_confirmed) == (80, True)
     assert told.rtt_ms == Percentiles(p50=0.0, p99=0.0, p999=0.0, max=0.0)
     assert (told.is_timesync_good, told.slow_clock) == (True, None)
     assert told.vehicle_clock_offset_ns == -rig.vehicle.boot_ns

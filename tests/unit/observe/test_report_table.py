@@ -45,9 +45,9 @@ def test_the_table_holds_what_was_measured_in_milliseconds() -> None:
 )
 def test_the_link_verdict_is_honest(link: dict[str, Any], expected: str) -> None:
     good = {"lost_fraction": 0.0, "echo_confirmed": True}
-    stats = LinkStats(messages_per_s={}, rtt_ms=None, sent_overrides=1, **(good | link))
+    stats = LinkStats(messages_per_s={}, rtt_ms=None, sent_actions=1, **(good | link))
     (line,) = (each for each in verdict_lines(report_of(make_tick(), link=stats)) if "link" in each)
-    assert line.startswith("link     1 stick message sent, ")
+    assert line.startswith("link     1 command sent, ")
     assert expected in line
 
 

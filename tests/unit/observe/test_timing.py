@@ -25,7 +25,7 @@ LINK = LinkStats(
     messages_per_s={"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
     lost_fraction=0.001,
     rtt_ms=None,
-    sent_overrides=6000,
+    sent_actions=6000,
     echo_confirmed=True,
 )
 
