@@ -162,7 +162,7 @@ class Telemetry(NamedTuple):
         return self[:4]
 
     @property
-    def attitude_ns(self) -> int:
+    def attitude_arrived_ns(self) -> int:
         """Arrival of the newest attitude; 0 before the first."""
         attitude = self.ned_from_body_wxyz
         return 0 if attitude is None else attitude.arrived_ns

@@ -138,13 +138,13 @@ class PolicyLoop:
     @property
     def has_news(self) -> bool:
         """True if an attitude has arrived that starts the next solve."""
-        return self._view.telemetry.attitude_ns >= self.start_ns
+        return self._view.telemetry.attitude_arrived_ns >= self.start_ns
 
     def step(self) -> None:
         """Solve once from the newest inputs, or tell the guard why that is impossible."""
         now_ns, is_starting = self._clock.now_ns(), self._is_starting
         telemetry, has_position = self._view.telemetry, self._view.status.has_position
-        self._seen_ns = telemetry.attitude_ns
+        self._seen_ns = telemetry.attitude_arrived_ns
         due_ns = now_ns if self._due_ns is None or is_starting else self._due_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
         self._due_ns = max(due_ns, now_ns - self._period_ns // 2) + self._period_ns * 99 // 100
@@ -152,7 +152,7 @@ class PolicyLoop:
             self._reset_ns = now_ns
             self._runner.reset()
         for past in self._view.take_past(self._seen_ns):
-            arrived_ns = past.attitude_ns
+            arrived_ns = past.attitude_arrived_ns
             before = self._view.reader.read(past, arrived_ns, has_position=has_position)
             if isinstance(before, VehicleState):
                 self._observations.push(before)

@@ -106,7 +106,7 @@ class TelemetryCache:
     def take_past(self, until_ns: int) -> list[Telemetry]:
         """Return the telemetry at each attitude since the last call, up to arrival ``until_ns``."""
         taken: list[Telemetry] = []
-        while self._past and self._past[0].attitude_ns <= until_ns:
+        while self._past and self._past[0].attitude_arrived_ns <= until_ns:
             taken.append(self._past.popleft())
         return taken
 
@@ -120,7 +120,7 @@ class TelemetryCache:
             while True:
                 for data in port.receive():
                     self.receive(decode_from_guard(data))
-                if self.telemetry.attitude_ns > newer_than_ns:
+                if self.telemetry.attitude_arrived_ns > newer_than_ns:
                     return True
                 if (left_ns := until_ns - clock.now_ns()) <= 0:
                     return False
@@ -167,7 +167,7 @@ class TelemetryCache:
         for _, datagram in groupby(samples, key=lambda sample: sample.reading.arrived_ns):
             known, self.telemetry = self.telemetry, self.telemetry._replace(**dict(datagram))
             # After each datagram: which of them came in one batch is not in a recording.
-            if self.telemetry.attitude_ns != known.attitude_ns:
+            if self.telemetry.attitude_arrived_ns != known.attitude_arrived_ns:
                 self._past.append(self.telemetry)
 
     def _receive_tick(self, tick: GuardTick) -> None:

@@ -285,7 +285,7 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
         rig.clock.advance_ns(8 * MS)
         if has_come:
             rig.measure()
-            assert rig.view.telemetry.attitude_ns > newer_than_ns
+            assert rig.view.telemetry.attitude_arrived_ns > newer_than_ns
         return has_come
 
     rig.view.wait_for_attitude = wait  # type: ignore[method-assign]

@@ -195,7 +195,7 @@ def test_an_attitude_wakes_who_waits_for_it_and_a_velocity_does_not(awaited: Awa
 def test_a_tick_brings_the_samples_that_a_busy_policy_has_not_read(awaited: Awaited) -> None:
     awaited.send(level_telemetry(START_NS))
     awaited.view.receive(NOBODY)
-    assert awaited.view.telemetry.attitude_ns == START_NS
+    assert awaited.view.telemetry.attitude_arrived_ns == START_NS
 
 
 def test_a_guard_that_is_gone_is_waited_for_no_longer_than_asked(awaited: Awaited) -> None:
