@@ -313,7 +313,7 @@ def _is_mode_ours(m: Memory, now: EngagementInputs) -> bool:
 def _failsafe(m: Memory, now: EngagementInputs, *, keeps_mode: bool) -> Reason | None:
     """Return why an armed vehicle is in a failsafe, or None.
 
-    ``keeps_mode``: True asks for one that left our mode, False for one that changed it. ArduPilot
+    ``keeps_mode``: True asks for one that kept our mode, False for one that changed it. ArduPilot
     reports a failsafe together with the mode that it sets. PX4 may report it earlier, so that our
     mode tells nothing there.
     """

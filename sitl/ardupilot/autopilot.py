@@ -184,11 +184,7 @@ class ArduCopter(Autopilot):
             return STOPPED
         sticks = read_sticks(self.rc, self.params)
         if self.landed:
-            if not (
-                self.control.guided.lifts_off(self.now_ns, self._armed_ns)
-                if self.mode.is_guided
-                else self.control.wants_takeoff(self.mode, sticks)
-            ):
+            if not self._lifts_off(sticks):
                 if self.mode.lands or self._is_idle(sticks):
                     self.disarm(force=False)
                 return self.control.idle(self.sensed)
@@ -197,6 +193,11 @@ class ArduCopter(Autopilot):
         return self.control.fly(
             self.mode, sticks, self.sensed, self.now_ns, has_position=self.position_ready
         )
+
+    def _lifts_off(self, sticks: Sticks) -> bool:
+        if self.mode.is_guided:
+            return self.control.guided.lifts_off(self.now_ns, self._armed_ns)
+        return self.control.wants_takeoff(self.mode, sticks)
 
     def _is_idle(self, sticks: Sticks) -> bool:
         """True after DISARM_DELAY on the ground with the throttle at the bottom, not centred."""
