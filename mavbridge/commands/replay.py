@@ -180,14 +180,10 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
 
     limits, policy = given(flown.limits), given(flown.policy)
     if asked.policy is not None:  # weights and files of the flight belong to another policy
-        usual = PolicyConfig()
         own = ("checkpoint", "contract", "by_rates", "image_size", "allow_untrained")
-        policy = {name: getattr(usual, name) for name in own} | policy
-    return replace(
-        flown,
-        limits=replace(flown.limits, **limits),
-        policy=replace(flown.policy, **policy),
-    )
+        policy = {name: getattr(PolicyConfig(), name) for name in own} | policy
+    limited, other = replace(flown.limits, **limits), replace(flown.policy, **policy)
+    return replace(flown, limits=limited, policy=other)
 
 
 def tolerance_of(

@@ -141,9 +141,7 @@ class Code(StrEnum):
         "firewall, or a full queue"
     )
     UNHEARD = _vehicle("the vehicle does not hear our {quantity}")
-    NO_ECHO = _vehicle(
-        "no {message} arrives: the vehicle does not hear our {quantity}, or does not show them"
-    )
+    NO_ECHO = _vehicle("no {message} arrives: our {quantity} are not heard, or not shown")
     LATE_SENDING = _vehicle("our packets take {age_ms:.0f} ms or more to reach the vehicle")
     READING_PARAMETERS = _waiting(
         "reading the vehicle's parameters: if this lasts, check port, baud rate and signing"

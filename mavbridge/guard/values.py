@@ -116,7 +116,7 @@ class EngagementSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngagementOutput:
-    """What the engagement wants of the guard now."""
+    """Output of the engagement at one moment."""
 
     control: ControlSource | None = None
     """None: send nothing."""

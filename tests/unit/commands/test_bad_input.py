@@ -110,7 +110,7 @@ BAD = [
     ("export-policy --out taken.mp4", "is taken"),
     ("export-policy --out taken.mp4/onnx", "--out taken.mp4/onnx cannot be written"),
     ("identify --connect udp:127.0.0.1:1 --readonly", "--readonly"),
-    (f"{START} --exe-steps 5 --frames 4", "--exe-steps 5 is more than --frames 4"),
+    (f"{START} --exe-steps 5 --frames 4", "--exe-steps 5 exceeds --frames 4"),
     (f"{START} --frames 17", "--frames 17 is more than the 16"),
     (f"{START} --exe-steps 17", "--exe-steps 17 is more than the 16"),
     ("imagine --start flight --out a.mp4 --ddim-steps 101", "1..100"),
