@@ -120,7 +120,7 @@ def test_level_sticks_go_ahead_of_a_release_that_would_keep_ours(
     [
         (ManualControl(300, 0, 700, 0), Code.OVERRULED, "another station sends sticks"),
         (ManualControl(0, 0, 500, 0), Code.UNHEARD, "our sticks"),
-        (None, Code.NO_ECHO, "does not hear our sticks, or"),
+        (None, Code.NO_ECHO, "our sticks are not heard, or"),
     ],
 )
 def test_what_px4_acts_on_instead_of_our_sticks_is_told(
