@@ -6,8 +6,8 @@ Flights of the expert teach a first student; in rounds the students fly, the exp
 and they learn from that. toge-rates then learns the end of a flight alone, in two rounds. At last
 both learn other looks (teach_looks.py). The trainings take 3 h 5 min for toge and 6 h 32 min for
 toge-rates, beside the flights. What shipped was made a little differently
-(policy/weights/README.md). Both recipes have been run to the end with two flights and eight steps
-in place of each number, neither in full.
+(policy/weights/README.md). Neither recipe has been run in full; both have been run to the end with
+two flights a step and eight optimiser steps a training.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
 kept, and an unfinished training begins again. Seeds determine the flights. Training budgets are

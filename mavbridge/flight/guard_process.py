@@ -284,7 +284,7 @@ def start_guard(
 
     ``pilot_hz``: rate of a pilot's sticks, recorded with all packets while none of ours is sent.
     """
-    link = link_settings(config, config.rates.loops(is_dual=config.policy.dual_rate is not False))
+    link = link_settings(config)
     if pilot_hz is not None:
         link = replace(link, pilot_hz=pilot_hz, stick_hz=0.0)
     tlog_pipe = None if config.record is None else open_tlog_pipe()

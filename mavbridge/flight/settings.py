@@ -105,8 +105,12 @@ def state_folder() -> Path:
     return root / "mavbridge"
 
 
-def link_settings(config: FlyConfig, loops: LoopRates) -> LinkSettings:
-    """Return the settings of the link. Chunks are sent between slots, too."""
+def link_settings(config: FlyConfig, loops: LoopRates | None = None) -> LinkSettings:
+    """Return the settings of the link. Chunks are sent between slots, too.
+
+    ``loops`` None: the rates that a flight asks for before its policy is known.
+    """
+    loops = loops or config.rates.loops(is_dual=config.policy.dual_rate is not False)
     link, signing = config.link, None
     if link.signing_key_file is not None:
         signing = SigningFiles(key_file=link.signing_key_file, state_folder=state_folder())

@@ -63,8 +63,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     ) -> None:
         self.settings: TrainSettings = settings
         self._network = network
-        measured_ns = _ages(flights, settings)
-        self._ages_ns = measured_ns if len(measured_ns) else _evenly(USUAL_AGES_MS)
+        known_ns = _ages(flights, settings)
+        self._ages_ns = known_ns if len(known_ns) else _evenly(USUAL_AGES_MS)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._teacher = copy.deepcopy(trainee).eval() if settings.only_end else None
@@ -75,7 +75,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         )
         steps = network.schedule.num_train_timesteps
         self._batches = Batches(timeline, kept, self.images, timesteps=steps, settings=settings)
-        if len(measured_ns) == 0:
+        if len(known_ns) == 0:
             low_ms, high_ms = USUAL_AGES_MS
             self.note(
                 f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
@@ -156,8 +156,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
     """Return sorted image ages to train for: measured ones, or a uniform range.
 
-    None if no policy flew, as in a human pilot's flights. An image that stayed for seconds, as of a
-    camera that paused, is not flown by.
+    Empty if no policy flew, as in a human pilot's flights. An image that stayed for seconds, as of
+    a camera that paused, is not flown by.
     """
     if settings.age_range_ms is not None:
         return _evenly(settings.age_range_ms)

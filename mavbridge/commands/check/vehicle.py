@@ -114,11 +114,7 @@ def check_vehicle(
     if config.link.connect == NO_VEHICLE:
         return [_link_row("vehicle", "none", "none for this check")]
     print_status(f"listening to the vehicle on {config.link.connect}")
-    # As a flight asks for, before its policy is known.
-    settings = link_settings(
-        config, config.rates.loops(is_dual=config.policy.dual_rate is not False)
-    )
-    settings = replace(settings, readonly=True, set_params=())
+    settings = replace(link_settings(config), readonly=True, set_params=())
     rows: list[CheckRow] = []
     try:
         with ExitStack() as stack:

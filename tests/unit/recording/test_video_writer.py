@@ -57,19 +57,22 @@ def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
     assert [(rgb.shape, number_of(rgb)) for rgb in images] == [((48, 66, 3), k) for k in range(3)]
 
 
+def one_picture_kept(folder: Path) -> list[int]:
+    """Write one picture, offline; return the numbers of those in the video."""
+    with writer(folder, "offline") as video:
+        video.submit(picture(0), 0)
+        video.finish()
+    return read_back(folder / "camera.mp4")
+
+
 def test_a_pause_of_both_processes_is_no_hang(tmp_path: Path) -> None:
     wait, pauses = video_writer.wait, [[]]
 
     def paused_once(*ends_and_timeout: Any) -> list[Any]:
         return pauses.pop() if pauses else wait(*ends_and_timeout)
 
-    with (
-        patch.object(video_writer, "wait", paused_once),
-        writer(tmp_path, "offline") as video,
-    ):
-        video.submit(picture(0), 0)
-        video.finish()
-    assert read_back(tmp_path / "camera.mp4") == [0]
+    with patch.object(video_writer, "wait", paused_once):
+        assert one_picture_kept(tmp_path) == [0]
 
 
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
@@ -105,13 +108,8 @@ def test_a_signal_to_its_group_does_not_end_a_writer_that_starts(tmp_path: Path)
             os.kill(started[1].pid, number)
         return started
 
-    with (
-        patch.object(video_writer, "start_process", struck),
-        writer(tmp_path, "offline") as video,
-    ):
-        video.submit(picture(0), 0)
-        video.finish()
-    assert read_back(tmp_path / "camera.mp4") == [0]
+    with patch.object(video_writer, "start_process", struck):
+        assert one_picture_kept(tmp_path) == [0]
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
 
 
